@@ -48,8 +48,12 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = {name: name for name in ("records", "scenes")}
-_MODULES |= {name: f"evaluate.{name}" for name in ("figures", "metrics")}
+_MODULES = {
+    "figures": "evaluate.figures",
+    "metrics": "evaluate.metrics",
+    "records": "records",
+    "scenes": "scenes",
+}
 _NAMES = {  # of what each module gives
     "brackets": "Bracket",
     "compiling": "enable_compile_cache",
@@ -77,13 +81,48 @@ _NAMES = {  # of what each module gives
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 
-__all__ = ["CHARTS", "Arm", "Bracket", "Chart", "Fit", "FitError", "FitOptions", "FitWarning"]
-__all__ += ["Fitted", "GeneratingFunction", "Hamiltonian", "InputError", "Lagrangian", "Monitors"]
-__all__ += ["Pairs", "Recording", "Scene", "SymplecticMap", "TrainingData", "WorkError", "between"]
-__all__ += ["discover", "enable_compile_cache", "export", "figures", "fit", "fit_monitors"]
-__all__ += ["from_function", "load", "metrics", "read", "records", "reference_trajectories"]
-__all__ += ["register", "register_function", "sample_pairs", "sample_states", "sample_test_states"]
-__all__ += ["scenes", "stroboscopic"]
+__all__ = [
+    "CHARTS",
+    "Arm",
+    "Bracket",
+    "Chart",
+    "Fit",
+    "FitError",
+    "FitOptions",
+    "FitWarning",
+    "Fitted",
+    "GeneratingFunction",
+    "Hamiltonian",
+    "InputError",
+    "Lagrangian",
+    "Monitors",
+    "Pairs",
+    "Recording",
+    "Scene",
+    "SymplecticMap",
+    "TrainingData",
+    "WorkError",
+    "between",
+    "discover",
+    "enable_compile_cache",
+    "export",
+    "figures",
+    "fit",
+    "fit_monitors",
+    "from_function",
+    "load",
+    "metrics",
+    "read",
+    "records",
+    "reference_trajectories",
+    "register",
+    "register_function",
+    "sample_pairs",
+    "sample_states",
+    "sample_test_states",
+    "scenes",
+    "stroboscopic",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -103,8 +103,10 @@ class Bracket:
             raise FitError("expected constants with c_ijk = −c_jik")
         failure = jacobi_failure(constants)
         if failure > _ROUNDOFF * size**2:
-            told = f"Jacobi's identity fails by {failure / size**2:.1e} of the constants' size"
-            raise FitError(f"{told}: these constants are not those of a Lie algebra")
+            raise FitError(
+                f"Jacobi's identity fails by {failure / size**2:.1e} of the constants' size: "
+                "these constants are not those of a Lie algebra"
+            )
         return LieAlgebra(constants, None, (), tuple(names))
 
     @staticmethod
@@ -387,8 +389,12 @@ class Magnetic(Bracket):
         if j < d:
             return ""
         values = (inverse @ c @ inverse for c in self.field)
-        own = zip(values, self.powers, strict=True)
-        return added([(c[i - d, j - d], _product(self.labels[:d], p)) for c, p in own])
+        return added(
+            [
+                (c[i - d, j - d], _product(self.labels[:d], p))
+                for c, p in zip(values, self.powers, strict=True)
+            ]
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

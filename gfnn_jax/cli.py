@@ -112,8 +112,10 @@ def _records(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS, path
 
     for name, record in RECORDS.items():
-        about = f"{record.what}; positions {', '.join(record.positions)}"
-        print(f"{name:16} {about}\n{'':16} {path(name)}")
+        print(
+            f"{name:16} {record.what}; positions {', '.join(record.positions)}\n"
+            f"{'':16} {path(name)}"
+        )
     print("gfnn run NAME learns the law of two thirds of a record and forecasts the last third")
 
 
@@ -261,8 +263,10 @@ def _fit(arguments: argparse.Namespace) -> None:
     if of_states or are_recordings(arguments.data, with_roles=names_roles(columns)):
         return _fit_recording(arguments, columns, options)
     if options.get("learn") == "lagrangian":
-        told = f"{arguments.data[0]} is read as states q, p. If its columns are measured positions"
-        raise InputError(f"--learn lagrangian: {told}, name them: --positions A,B")
+        raise InputError(
+            f"--learn lagrangian: {arguments.data[0]} is read as states q, p. If its columns are "
+            "measured positions, name them: --positions A,B"
+        )
     options["angles"] = _as_indices(columns)
     with _processes(arguments) as join:
         with _output(arguments, options.get("devices")) as output:

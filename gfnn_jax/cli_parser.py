@@ -154,9 +154,12 @@ class _Command:
 def parser() -> argparse.ArgumentParser:
     """Make the parser; what it parses has the command's name as ``command``."""
     plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
-    about = "Find the law of motion in data, predict with exactly symplectic maps."
-    epilog = f"{WORKFLOW}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}"
-    found = _Parser(prog="gfnn", description=about, epilog=epilog, **plain)
+    found = _Parser(
+        prog="gfnn",
+        description="Find the law of motion in data, predict with exactly symplectic maps.",
+        epilog=f"{WORKFLOW}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
+        **plain,
+    )
     found.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = found.add_subparsers(required=True, metavar="COMMAND")
 
@@ -247,10 +250,16 @@ def _fit(command: _Command) -> None:
     command.add_fit()
     add_column_options(command.parser)
     _add_despite(command)
-    about = "of a recording: write the law into MODEL although it misses most of the motion; the"
-    command.flag("--keep", f"{about} exit status is 1 all the same")
-    of_each = "each reads its own rows of DATA, or its own files"
-    command.flag("--distributed", f"this is one of several processes, by srun, say: {of_each}")
+    command.flag(
+        "--keep",
+        "of a recording: write the law into MODEL although it misses most of the motion; the exit "
+        "status is 1 all the same",
+    )
+    command.flag(
+        "--distributed",
+        "this is one of several processes, by srun, say: each reads its own rows of DATA, or its "
+        "own files",
+    )
 
 
 def _add_despite(command: _Command) -> None:
@@ -283,8 +292,10 @@ def _predict(command: _Command) -> None:
     command.add("--out", about, "FILE", type=Path, required=True)
     about = "maps drawn from the model's posterior: adds std and quantiles to FILE"
     command.add("--samples", about, "N", type=_count)
-    about = "adds the first step at which the band of the position (two standard deviations of"
-    about = f"with --samples: {about} its distance) exceeds SIZE, in the data's unit"
+    about = (
+        "with --samples: adds the first step at which the band of the position (two standard "
+        "deviations of its distance) exceeds SIZE, in the data's unit"
+    )
     command.add("--horizon", about, "SIZE", type=_positive)
     about = "what to do where a trajectory leaves the data's domain (default continue)"
     command.add("--outside", about, choices=("continue", "stop"))

@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 _FEW_TERMS = 15  # of a law with noise that is shown as H
-_MEANS = {"left the domain": " (extrapolated from there)"}
-_MEANS |= dict.fromkeys(("not converged", "non-finite"), " (NaN from there)")
+_MEANS = {
+    "left the domain": " (extrapolated from there)",
+    "not converged": " (NaN from there)",
+    "non-finite": " (NaN from there)",
+}
 
 
 def law_line(report: dict[str, Any]) -> str:
@@ -21,8 +24,10 @@ def law_line(report: dict[str, Any]) -> str:
     chosen = report["model"]["learns"] == "hamiltonian"
     noisy = report["data"]["noise"] is not None and len(law["terms"]) <= _FEW_TERMS
     if chosen and not fit["tolerance_met"] and not noisy:
-        told = f"H of {len(law['terms'])} terms, one-step error {fit['validation_relative']:.1e}"
-        return f"best partial law: {told} of the spread (report.json)"
+        return (
+            f"best partial law: H of {len(law['terms'])} terms, one-step error "
+            f"{fit['validation_relative']:.1e} of the spread (report.json)"
+        )
     return f"{'' if chosen else 'found, and costlier per step than the map: '}H = {law['formula']}"
 
 
@@ -146,9 +151,11 @@ def print_forecasts(found: Any, out: Path) -> None:
         return
     for name, (rms, median, within) in compared.columns.items():
         unit = f" {compared.units[name]}".rstrip()
-        sizes = f"RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}"
-        share = f"{within:.0%} of {compared.num_samples} samples within two standard deviations"
-        print(f"{name}: {sizes}; {share} (95 % expected)")
+        print(
+            f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
+            f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
+            "(95 % expected)"
+        )
 
 
 def print_predicted(predicted: Any, asked: Any, out: Path) -> None:
@@ -160,8 +167,10 @@ def print_predicted(predicted: Any, asked: Any, out: Path) -> None:
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        where = f"{passed.size} of {num_lanes} trajectories{first}"
-        print(f"the band of the position (2 σ) exceeds {asked.horizon:g} in {where}")
+        print(
+            f"the band of the position (2 σ) exceeds {asked.horizon:g} in {passed.size} of "
+            f"{num_lanes} trajectories{first}"
+        )
 
 
 def _print_status(status, left_at) -> None:
@@ -188,12 +197,16 @@ def comparison_table(compared: dict[str, Any]):
         shown.add_column(head, justify="left" if head == "method" else "right")
     for m in compared["methods"].values():
         fit, rolled = m["fit"], m["rollout"]
-        error = (fit["validation_rms"], rolled["error"]["100"], rolled["error"]["1000"])
-        took = f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else "")
-        cells = [f"{m['model']['num_parameters']:,}", took]
-        cells += [f"{rolled['microseconds_per_step']:.2g}"]
-        cells += [*map(_number, error), _number(rolled["growth_exponent"], ".2f")]
-        cells += [_number(m["map"]["symplecticity_defect"])]
-        cells += [", ".join(_number(v, ".2g") for v in m["kl"].values())] if chaotic else []
-        shown.add_row(m["title"], *cells)
+        shown.add_row(
+            m["title"],
+            f"{m['model']['num_parameters']:,}",
+            f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else ""),
+            f"{rolled['microseconds_per_step']:.2g}",
+            _number(fit["validation_rms"]),
+            _number(rolled["error"]["100"]),
+            _number(rolled["error"]["1000"]),
+            _number(rolled["growth_exponent"], ".2f"),
+            _number(m["map"]["symplecticity_defect"]),
+            *([", ".join(_number(v, ".2g") for v in m["kl"].values())] if chaotic else []),
+        )
     return shown

@@ -28,8 +28,9 @@ TIME = "t"  # the name, among args, of the time of a drive; it is the last of th
 def require_x64(what: str) -> None:
     """Raise RuntimeError where JAX would silently compute ``what`` in float32."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        told = "call jax.config.update('jax_enable_x64', True) first"
-        raise RuntimeError(f"{what} needs float64: {told}")
+        raise RuntimeError(
+            f"{what} needs float64: call jax.config.update('jax_enable_x64', True) first"
+        )
 
 
 def split(z):
@@ -163,8 +164,10 @@ class Pairs:
         if isinstance(self.dt, (list, tuple, np.ndarray, jax.Array)):
             self._set("dt", np.asarray(self.dt) if np.ndim(self.dt) else self.dt)
             if np.ndim(self.dt) and np.shape(self.dt) != (len(self),):
-                wanted = f"expected dt as one number or one per pair ({len(self)},)"
-                raise FitError(f"{wanted}, got shape {np.shape(self.dt)}")
+                raise FitError(
+                    f"expected dt as one number or one per pair ({len(self)},), got shape "
+                    f"{np.shape(self.dt)}"
+                )
         if self.args is not None:
             self._set("args", _named(self.args, len(self)))
         if self.t0 is not None or TIME in (self.args or {}):
@@ -174,9 +177,10 @@ class Pairs:
             self._set("std", np.asarray(self.std, np.float64))
             width = self.z0.shape[1]
             if self.std.shape not in ((width,), (len(self), width)):
-                wanted = f"({width},), one of each coordinate, or ({len(self)}, {width})"
-                got = f"got {self.std.shape}"
-                raise FitError(f"expected std of shape {wanted}, one of each value, {got}")
+                raise FitError(
+                    f"expected std of shape ({width},), one of each coordinate, or "
+                    f"({len(self)}, {width}), one of each value, got {self.std.shape}"
+                )
             if not (np.isfinite(self.std) & (self.std > 0)).all():
                 raise FitError("expected every std finite and above 0; leave std out if unknown")
 
@@ -185,12 +189,14 @@ class Pairs:
         width, any_width = self.z0.shape[-1], self.structure == POISSON
         if self.z0.shape != self.z1.shape or self.z0.ndim != 2 or width < 2:
             shape = "(N, n), n ≥ 2" if any_width else "(N, 2d)"
-            got = f"{self.z0.shape} and {self.z1.shape}"
-            raise FitError(f"expected z0 and z1 of one shape {shape}, got {got}")
+            raise FitError(
+                f"expected z0 and z1 of one shape {shape}, got {self.z0.shape} and {self.z1.shape}"
+            )
         if width % 2 and not any_width:
-            told = f"{width} columns are no positions and momenta (q, p). Of states with another"
-            call = 'gfnn.Pairs(z0, z1, dt, structure="poisson")'
-            raise FitError(f"{told} bracket, as angular velocities: {call}")
+            raise FitError(
+                f"{width} columns are no positions and momenta (q, p). Of states with another "
+                'bracket, as angular velocities: gfnn.Pairs(z0, z1, dt, structure="poisson")'
+            )
         if self.names and len(self.names) != width:
             raise FitError(f"expected {width} names of coordinates, got {len(self.names)}")
 
@@ -205,8 +211,10 @@ class Pairs:
                 continue
             values = np.asarray(given)
             if values.shape != (len(self),) or values.dtype.kind not in kinds:
-                wanted = f"{name} as {what} of shape ({len(self)},)"
-                raise FitError(f"expected {wanted}, got {values.dtype} of shape {values.shape}")
+                raise FitError(
+                    f"expected {name} as {what} of shape ({len(self)},), got {values.dtype} of "
+                    f"shape {values.shape}"
+                )
             self._set(name, values.astype(str) if values.dtype.kind in "SO" else values)
 
     def _set_time(self) -> None:
@@ -236,10 +244,19 @@ class Pairs:
         """Invert ``tree_flatten``."""
         (dt, period, runs, own_kind), (z0, z1, args, run, place, std, *own) = fixed, leaves
         run = run if runs is None else np.array(runs)
-        known = {"period": period, "run": run, "place": place, "std": std}
         structure, names = own_kind
-        dt = own[0] if own else dt
-        return cls(z0, z1, dt, args, **known, structure=structure, names=names)
+        return cls(
+            z0,
+            z1,
+            own[0] if own else dt,
+            args,
+            period=period,
+            run=run,
+            place=place,
+            std=std,
+            structure=structure,
+            names=names,
+        )
 
     def __len__(self) -> int:
         return self.z0.shape[0]
@@ -255,9 +272,17 @@ class Pairs:
         args = self.args and {name: values[rows] for name, values in self.args.items()}
         run, place = (None if of is None else of[rows] for of in (self.run, self.place))
         std = self.std[rows] if np.ndim(self.std) == 2 else self.std
-        changes = {"args": args, "run": run, "place": place, "std": std}
-        z0, z1 = self.z0[rows], self.z1[rows]
-        return dataclasses.replace(self, z0=z0, z1=z1, dt=dt, t0=None, **changes)
+        return dataclasses.replace(
+            self,
+            z0=self.z0[rows],
+            z1=self.z1[rows],
+            dt=dt,
+            t0=None,
+            args=args,
+            run=run,
+            place=place,
+            std=std,
+        )
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:

@@ -151,13 +151,15 @@ def join() -> Share:
             raise InputError(f"expected a whole number as JAX_{name.upper()}, got '{text}'")
         given[name] = None if text is None else int(text)
     try:
-        given |= {"heartbeat_timeout_seconds": _HEARTBEAT, "shutdown_timeout_seconds": _PATIENCE}
-        jax.distributed.initialize(**given)
+        jax.distributed.initialize(
+            **given, heartbeat_timeout_seconds=_HEARTBEAT, shutdown_timeout_seconds=_PATIENCE
+        )
         jax.local_devices()  # all processes tell each other what they have: none may leave it out
     except (ValueError, TypeError, RuntimeError) as error:
-        told = "--distributed needs a launcher that JAX knows, such as srun or mpirun, or the"
-        told += " variables JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID"
-        raise InputError(f"{told} ({error})") from error
+        raise InputError(
+            "--distributed needs a launcher that JAX knows, such as srun or mpirun, or the "
+            f"variables JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID ({error})"
+        ) from error
     atexit.register(abandon, 1)  # of an exception that nobody expects
     return Share(jax.process_index(), jax.process_count())
 

@@ -61,9 +61,12 @@ def measured(
         return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
     images = np.where(steps.failed[:, None], np.nan, steps.images)
     error = measured_error(data, tolerance, images)
-    seconds, most = steps.microseconds_per_step, int(steps.iterations.max())
-    timed = {"newton_iterations_max": most, "microseconds_per_step": seconds}
-    candidate = dataclasses.replace(with_error(candidate, error), map=map_, **timed)
+    candidate = dataclasses.replace(
+        with_error(candidate, error),
+        map=map_,
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )
     return Assembled(candidate, steps.compile_seconds, failed=int(steps.failed.sum()))
 
 
@@ -76,10 +79,14 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
         images, solved = data.y1[rows], np.ones(len(rows), bool)
     args = data.given(rows[solved])[1]
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
-    dt = of_lanes(data.given(rows)[0], solved)
-    features = partial(inputs_of, data, features=features)
-    ends = data.y0[rows][solved], images[solved]
-    fitted = fit_predictors(generated.chart, *ends, dt, features, args)
+    fitted = fit_predictors(
+        generated.chart,
+        data.y0[rows][solved],
+        images[solved],
+        of_lanes(data.given(rows)[0], solved),
+        partial(inputs_of, data, features=features),
+        args,
+    )
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)
 
@@ -92,10 +99,16 @@ def composed(piece: Piece, data: Dataset) -> SymplecticMap:
         parameters = sampled(data.parameters, data.args, data.each_dt, data.period)
     if data.own_dt is not None and isinstance(piece, Generated):
         dt_range = np.array([data.own_dt.min(), data.own_dt.max()])
-    names = ("coordinates", "domain", "angle_centre", "dt")
-    own: dict[str, Any] = {name: getattr(data, name) for name in names}
-    own |= {"scale": data.spread, "parameters": parameters, "dt_range": dt_range}
-    map_ = SymplecticMap(pieces=(*data.before, piece, *data.after), **own)
+    map_ = SymplecticMap(
+        pieces=(*data.before, piece, *data.after),
+        coordinates=data.coordinates,
+        domain=data.domain,
+        scale=data.spread,
+        angle_centre=data.angle_centre,
+        dt=data.dt,
+        parameters=parameters,
+        dt_range=dt_range,
+    )
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
 
@@ -203,8 +216,12 @@ class Candidate:
 
 
 def _fields_of(error: OneStepError) -> dict[str, Any]:
-    found = {f"validation_{name}": getattr(error, name) for name in ("rms", "relative", "bound")}
-    return {**found, "deviations": error.deviations}
+    return {
+        "validation_rms": error.rms,
+        "validation_relative": error.relative,
+        "validation_bound": error.bound,
+        "deviations": error.deviations,
+    }
 
 
 def refined_images(

@@ -51,9 +51,13 @@ class Block:
 
     def rows(self, index: np.ndarray) -> Block:
         locate = self.locate  # `self` would keep all rows in memory
-        own = None if self.own is None else self.own[index]
-        at = self.sequence[index], self.place[index]
-        return Block(self.states[index], *at, lambda r, c: locate(int(index[r]), c), own)
+        return Block(
+            self.states[index],
+            self.sequence[index],
+            self.place[index],
+            lambda r, c: locate(int(index[r]), c),
+            None if self.own is None else self.own[index],
+        )
 
     @property
     def going(self) -> np.ndarray:
@@ -68,8 +72,10 @@ class Block:
             if bad.any():
                 row, column = (int(i) for i in np.argwhere(bad)[0])
                 count = int(bad.sum())
-                told = f"{count} value{'s' * (count != 1)} {what}, first {self.locate(row, column)}"
-                raise InputError(f"{path}: {told} = {self.states[row, column]}")
+                raise InputError(
+                    f"{path}: {count} value{'s' * (count != 1)} {what}, first "
+                    f"{self.locate(row, column)} = {self.states[row, column]}"
+                )
         return self
 
 
@@ -77,9 +83,12 @@ def joined(blocks: Iterable[Block], dim: int) -> Block:
     """Checked blocks of states (n, 2 · dim) one behind another; none may be there."""
     parts = [Block(np.empty((0, 2 * dim)), np.empty(0), np.empty(0, int)), *blocks]
     own = [block.own for block in parts if block.own is not None]
-    each = zip(*((block.states, block.sequence, block.place) for block in parts), strict=True)
-    states, sequence, place = map(np.concatenate, each)
-    return Block(states, sequence, place, own=np.concatenate(own) if own else None)
+    return Block(
+        np.concatenate([block.states for block in parts]),
+        np.concatenate([block.sequence for block in parts]),
+        np.concatenate([block.place for block in parts]),
+        own=np.concatenate(own) if own else None,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,10 +171,11 @@ def check_width(path, name: str, shape: tuple[int, ...]) -> int:
     """d of an array of shape (..., 2d)."""
     width = shape[-1]
     if width == 0 or width % 2:
-        told = f"{name} of shape {shape} must have an even last dimension 2d (q first, then p)"
-        other = "Of states with another bracket, as angular velocities, in Python"
-        call = 'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
-        raise InputError(f"{path}: {told}, found {width}. {other}: {call}")
+        raise InputError(
+            f"{path}: {name} of shape {shape} must have an even last dimension 2d (q first, then "
+            f"p), found {width}. Of states with another bracket, as angular velocities, in Python: "
+            'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
+        )
     return width // 2
 
 

@@ -144,17 +144,20 @@ def roles_of(
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
         if roles["inputs"] and not rest:
             sole = ", ".join(roles["inputs"])
-            told = f"by its name {sole} is what drives a motion, and no column shows what moves"
-            advice = f"If it is what moves, say so: --positions {shlex.quote(sole)}"
-            raise InputError(f"{source}: {told}. {advice}")
+            raise InputError(
+                f"{source}: by its name {sole} is what drives a motion, and no column shows what "
+                f"moves. If it is what moves, say so: --positions {shlex.quote(sole)}"
+            )
         found, told = _by_data(source, runs, rest, units)
         roles |= {role: (*roles[role], *of_role) for role, of_role in found.items()}
         notes += told
     for role in ("velocities", "momenta"):
         if len(roles[role]) > len(roles["positions"]) > 0:
-            are = f"{', '.join(roles[role])} are {role} and only {', '.join(roles['positions'])}"
-            name = f"Name each pair: --positions and --{role}, in one order"
-            raise InputError(f"{source}: by their names {are} positions. {name}")
+            raise InputError(
+                f"{source}: by their names {', '.join(roles[role])} are {role} and only "
+                f"{', '.join(roles['positions'])} positions. Name each pair: --positions and "
+                f"--{role}, in one order"
+            )
     return roles, notes
 
 
@@ -233,9 +236,11 @@ def _by_data(
         own = [np.stack([values[n] for n in moving], axis=1) for _, values in runs.values()]
         explained = first_order(times, own).explained if len(moving) > 1 else 0.0
         raise _unclear(source, columns, moving, unclear or inputs, explained)
-    positions, velocities = (*(x for x, _ in pairs), *lengths), tuple(v for _, v in pairs)
-    found = {"positions": positions, "velocities": velocities, "inputs": (*inputs, *switches)}
-    return found, notes
+    return {
+        "positions": (*(x for x, _ in pairs), *lengths),
+        "velocities": tuple(v for _, v in pairs),
+        "inputs": (*inputs, *switches),
+    }, notes
 
 
 def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int) -> Undecided:
@@ -246,12 +251,16 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     if len(names) == 3 and strengths[1] > _Options.one_axis * strengths[0]:
         least = _Options.runs_of_a_body
         wanted = f", from {least} or more runs of different speeds" * (runs < least)
-        told = f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}:"
-        return Undecided(told, {"structure": "poisson", "states": tuple(names)})
+        return Undecided(
+            f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}:",
+            {"structure": "poisson", "states": tuple(names)},
+        )
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
-    learn = "To learn its law, with an offset b of the sensor:"
-    options = {"coordinates": ("theta",), "observe": {main: "omega + b"}}
-    return Undecided(f"{source}: {shown}, and no column shows the angle. {learn}", options)
+    return Undecided(
+        f"{source}: {shown}, and no column shows the angle. To learn its law, with an offset b of "
+        "the sensor:",
+        {"coordinates": ("theta",), "observe": {main: "omega + b"}},
+    )
 
 
 def _of_speeds(source: str, names: Sequence[str], units: Units) -> Undecided:
@@ -260,10 +269,14 @@ def _of_speeds(source: str, names: Sequence[str], units: Units) -> Undecided:
     turning |= bool(_OF_TURNING.fullmatch(units.get(names[0], "")))
     place = [""] if len(names) == 1 else [str(i + 1) for i in range(len(names))]
     q, v = ("theta", "omega") if turning else ("x", "v")
-    observe = {n: f"{v}{i} + b{i}" for n, i in zip(names, place, strict=True)}
-    told = f"{source}: {', '.join(names)}: velocities, and no column shows a position. To learn a"
-    options = {"coordinates": tuple(q + i for i in place), "observe": observe}
-    return Undecided(f"{told} law, with offsets of the sensors:", options)
+    return Undecided(
+        f"{source}: {', '.join(names)}: velocities, and no column shows a position. To learn a "
+        "law, with offsets of the sensors:",
+        {
+            "coordinates": tuple(q + i for i in place),
+            "observe": {n: f"{v}{i} + b{i}" for n, i in zip(names, place, strict=True)},
+        },
+    )
 
 
 def _of_accelerations(source: str, columns: Mapping[str, np.ndarray]) -> Undecided:
@@ -278,9 +291,11 @@ def _of_accelerations(source: str, columns: Mapping[str, np.ndarray]) -> Undecid
         name = max(columns, key=lambda n: np.nanstd(columns[n]))
         what = "of a cart, say, with an offset of the sensor"
         options = {"coordinates": ("x",), "observe": {name: "x_ddot + b"}}
-    told = f"{', '.join(columns)}: accelerations by their units, and no column shows a position"
-    learn = f"To learn a law from one of them, {what}:"
-    return Undecided(f"{source}: {told}. {learn}", options)
+    return Undecided(
+        f"{source}: {', '.join(columns)}: accelerations by their units, and no column shows a "
+        f"position. To learn a law from one of them, {what}:",
+        options,
+    )
 
 
 def _unclear(
@@ -295,14 +310,18 @@ def _unclear(
     positions = {"positions": tuple(moving)}
     if explained > _Options.first_order:
         states = {"structure": "poisson", "states": tuple(moving)}
-        told = f"{source}: the names {', '.join(columns)} do not show what was measured; their"
-        told += f" rates are functions of {', '.join(moving)} themselves, as of states without"
-        told += f" velocities, of populations say:{as_typed(states)}"
-        return Undecided(f"{told}. If they are positions:{as_typed(positions)}", states)
-    names = f"the names {', '.join(moving)} do not show what was measured"
-    may = f"{', '.join(shown)} may be motion or what drives it"
-    name = f"Name them:{as_typed(positions)}, or some of them and --inputs"
-    return Undecided(f"{source}: {names}, and {may}. {name}", positions)
+        return Undecided(
+            f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
+            f"are functions of {', '.join(moving)} themselves, as of states without velocities, of "
+            f"populations say:{as_typed(states)}. If they are positions:{as_typed(positions)}",
+            states,
+        )
+    return Undecided(
+        f"{source}: the names {', '.join(moving)} do not show what was measured, and "
+        f"{', '.join(shown)} may be motion or what drives it. Name them:{as_typed(positions)}, or "
+        "some of them and --inputs",
+        positions,
+    )
 
 
 def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
@@ -344,9 +363,11 @@ def angles_of(
     angles = set(given) | {n for n in roles["positions"] if n in factors}
     if by_names:
         units_of_angles = ("deg", "°", "rad")
-        told = {n: _unit(units, n) for n in roles["positions"]}
-        by_unit = {n for n, unit in told.items() if unit.startswith(units_of_angles)}
-        angles |= by_unit | {n for n, unit in told.items() if is_angle(n) and not unit}
+        angles |= {
+            n
+            for n in roles["positions"]
+            if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(units_of_angles)
+        }
     return tuple(n for n in roles["positions"] if n in angles), factors
 
 
@@ -371,11 +392,15 @@ def time_unit_of(source: str, times: Sequence[str], units: Units, given: str | N
     for name in times:
         told = _time_unit(name, units)
         if told is None and given is None and _unit(units, name):
-            given = f"give it, one of {', '.join(SECONDS)}: --time-unit"
-            raise InputError(f"{source}: {name}: unit {units[name]!r} is not known; {given}")
+            raise InputError(
+                f"{source}: {name}: unit {units[name]!r} is not known; give it, one of "
+                f"{', '.join(SECONDS)}: --time-unit"
+            )
         if told is not None and given is not None and clock_of(told) != clock_of(given):
-            got = f"got the time unit {given} (--time-unit)"
-            raise InputError(f"{source}: {name} is in {told} by its header, {got}")
+            raise InputError(
+                f"{source}: {name} is in {told} by its header, got the time unit {given} "
+                "(--time-unit)"
+            )
         if told is not None:
             return told
     return given
@@ -423,9 +448,10 @@ def with_sigmas(
             values = np.asarray(given, np.float64)
             length = len(next(iter(tables[0].columns.values()), ()))
             if len(tables) > 1 or values.shape != (length,):
-                wanted = f"a number, or one for each of the {length} rows of one table"
-                got = f"got shape {values.shape} for {len(tables)} tables"
-                raise InputError(f"std of {name}: expected {wanted}, {got}")
+                raise InputError(
+                    f"std of {name}: expected a number, or one for each of the {length} rows of "
+                    f"one table, got shape {values.shape} for {len(tables)} tables"
+                )
             found[name] = name + _STD
             columns = {**tables[0].columns, found[name]: values}
             tables[0] = dataclasses.replace(tables[0], columns=columns)
@@ -441,9 +467,10 @@ def check_sigmas(source: str, sigmas: Mapping[str, str], values: Mapping[str, An
             sigma = columns[of]
             bad = np.isfinite(columns[name]) & ~(np.isfinite(sigma) & (sigma > 0))
             if bad.any():
-                got = f"got {sigma[bad][0]:g} ({bad.sum()} such rows in run {run})"
-                wanted = f"expected σ above 0 beside every value of {name}"
-                raise InputError(f"{source}: {of}: {wanted}, {got}")
+                raise InputError(
+                    f"{source}: {of}: expected σ above 0 beside every value of {name}, got "
+                    f"{sigma[bad][0]:g} ({bad.sum()} such rows in run {run})"
+                )
 
 
 def typical(
@@ -469,8 +496,10 @@ def with_crossings(observe: Mapping[str, Any], events: Mapping[str, str]) -> dic
     "crossing(h)". Raises InputError where h is no text, or a column stands in both."""
     for name, expression in events.items():
         if not (isinstance(expression, str) and expression.strip()):
-            wanted = f"an expression of coordinates as text, as {{'{name}': 'theta'}}"
-            raise InputError(f"events: {name}: expected {wanted}, got {expression!r}")
+            raise InputError(
+                f"events: {name}: expected an expression of coordinates as text, as "
+                f"{{'{name}': 'theta'}}, got {expression!r}"
+            )
         if name in observe:
             raise InputError(f"{name}: expected it in observe or in events, not in both")
     return {**observe, **{name: f"crossing({one})" for name, one in events.items()}}

@@ -54,10 +54,15 @@ class _StatesInText:
             self.period = blocks.check_dt(first["period"][0], f"{self.path}: the column period")
         further = (*self.states, "t", "sequence", "period")
         self.parameters = [n for n in self.names if n not in (*further, *moving)]
-        units = {n.lower(): unit for n, unit in self.file.units.items()}
-        names = tuple(re.sub(r"\W+", "_", name) for name in self.parameters)
-        more = {"period": self.period, "timed": self.with_time}
-        self.source = blocks.Source(dim, dt, self.blocks, units=units, parameters=names, **more)
+        self.source = blocks.Source(
+            dim,
+            dt,
+            self.blocks,
+            units={n.lower(): unit for n, unit in self.file.units.items()},
+            parameters=tuple(re.sub(r"\W+", "_", name) for name in self.parameters),
+            period=self.period,
+            timed=self.with_time,
+        )
 
     def _check_header(self) -> None:
         """Raises InputError where columns are missing, or are without a partner."""
@@ -67,8 +72,10 @@ class _StatesInText:
         found = {"missing": missing, "without a partner": others, "without numbers": words}
         for what, columns in found.items():
             if columns or not self.states:
-                must = f"must name q1..qd and p1..pd once each: {', '.join(columns)} {what}"
-                raise InputError(f"{self.path}: the header {must} in {','.join(self.file.names)}")
+                raise InputError(
+                    f"{self.path}: the header must name q1..qd and p1..pd once each: "
+                    f"{', '.join(columns)} {what} in {','.join(self.file.names)}"
+                )
 
     def _tables(self, rows: int) -> Generator[dict[str, np.ndarray], None, None]:
         """All columns of numbers by name, a block of rows at a time; sequences as numbers."""
@@ -85,8 +92,11 @@ class _StatesInText:
         moving = [n for n, step in steps.items() if np.any(step[same] != 0)]
         ignored = [*moving, *(n.lower() for n in self.file.text)]
         if ignored:
-            told = f"columns ignored: {', '.join(ignored)} (not constant in a sequence)"
-            warnings.warn(told, blocks.DataWarning, stacklevel=6)
+            warnings.warn(
+                f"{self.path}: columns ignored: {', '.join(ignored)} (not constant in a sequence)",
+                blocks.DataWarning,
+                stacklevel=6,
+            )
         return ignored
 
     def _check_period(self, table: dict[str, np.ndarray], period: float) -> None:
@@ -102,16 +112,19 @@ class _StatesInText:
         for table in self._tables(min(rows, blocks.BLOCK_ROWS)):
             length, begin = len(table["q1"]), passed
             nothing = np.zeros(length)
-            own = table.get("sequence", nothing)
-            sequence = begin + np.arange(length) if self.each_row else own
+            sequence = (
+                begin + np.arange(length) if self.each_row else table.get("sequence", nothing)
+            )
             time = table["t"] if self.with_time else nothing
             told = np.stack([sequence, time, *(table[n] for n in self.parameters)], axis=1)
             both = np.concatenate([last, told])
             begins = both[1:, 0] != both[:-1, 0]
             for row in np.flatnonzero(begins):
                 if sequence[row] in earlier or not np.isfinite(sequence[row]):
-                    must = f"the rows of sequence {sequence[row]:g} must stand together"
-                    raise InputError(f"{self.path}: {self.file.locate(begin + int(row))}: {must}")
+                    raise InputError(
+                        f"{self.path}: {self.file.locate(begin + int(row))}: the rows of sequence "
+                        f"{sequence[row]:g} must stand together"
+                    )
                 if "sequence" in table:
                     earlier.add(float(sequence[row]))
             if self.with_time:
@@ -140,9 +153,11 @@ class _StatesInText:
         if bad.any():
             row = int(np.argmax(bad))
             before, now = (", ".join(f"{v:g}" for v in values[r]) for r in (row, row + 1))
-            wanted = f"expected {', '.join(self.parameters)} finite and constant in each sequence"
-            found = f"as parameters are, found {now} after {before}"
-            raise InputError(f"{self.path}: {self.file.locate(begin + row)}: {wanted}, {found}")
+            raise InputError(
+                f"{self.path}: {self.file.locate(begin + row)}: expected "
+                f"{', '.join(self.parameters)} finite and constant in each sequence, as parameters "
+                f"are, found {now} after {before}"
+            )
 
     def _check_times_rise(self, time: np.ndarray, sequence: np.ndarray, begin: int) -> None:
         """Raises InputError where times do not rise in a sequence. ``time`` and ``sequence`` start
@@ -151,8 +166,10 @@ class _StatesInText:
         bad = ((sequence[1:] == sequence[:-1]) & ~(np.diff(time) > 0)) | ~np.isfinite(time[1:])
         if bad.any():
             row = int(np.argmax(bad))
-            found = f"{time[row + 1]:.9g} in {self.file.locate(begin + row)} after {time[row]:.9g}"
-            raise InputError(f"{self.path}: the column t must rise in a sequence, found {found}")
+            raise InputError(
+                f"{self.path}: the column t must rise in a sequence, found {time[row + 1]:.9g} in "
+                f"{self.file.locate(begin + row)} after {time[row]:.9g}"
+            )
 
 
 def _first_dt(states: _StatesInText, table: dict[str, np.ndarray]) -> float | None:

@@ -196,9 +196,12 @@ def _related(traits: Traits) -> Iterator[Fault]:
     if other is not None:
         positions, velocities = zip(*other, strict=True)
         finding = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
-        finding = f"the columns are in another order than their names say: {finding}"
-        order = {"positions": positions, "velocities": velocities}
-        yield Fault("order", finding, "Name them in that order:", order)
+        yield Fault(
+            "order",
+            f"the columns are in another order than their names say: {finding}",
+            "Name them in that order:",
+            {"positions": positions, "velocities": velocities},
+        )
         return
     unit = _time_unit(recording.time_unit, [relation.factor for relation in known.values()])
     if unit is not None:

@@ -113,14 +113,26 @@ def read_trajectories(
     lengths, pairs = np.diff(begins, append=len(sequence)), len(going)
     needed = 2 * source.dim + 1 if fewest is None else fewest
     if pairs < needed:
-        found = f"{pairs} pair{'s' * (pairs != 1)} of consecutive states found"
-        raise InputError(f"{path}: {found}, at least {needed} are needed for d = {source.dim}")
+        raise InputError(
+            f"{path}: {pairs} pair{'s' * (pairs != 1)} of consecutive states found, at least "
+            f"{needed} are needed for d = {source.dim}"
+        )
     for odd in _odd_columns(states, going):
         warnings.warn(f"{path}: {odd}", blocks.DataWarning, stacklevel=2)
     known = (labels(sequence[going]), whole.place[going])
     identities = (None, None) if source.of_pairs_alone else known
-    about = str(path), digest_of(path), source.precision, source.units, args, source.period
-    return TrajectoryData(states, lengths, dt, *about, *identities)
+    return TrajectoryData(
+        states,
+        lengths,
+        dt,
+        str(path),
+        digest_of(path),
+        source.precision,
+        source.units,
+        args,
+        source.period,
+        *identities,
+    )
 
 
 def labels(sequence: np.ndarray) -> np.ndarray:
@@ -167,8 +179,10 @@ def iterate_pairs(
     own, of_rows = own_files(paths, share)
     for number, path in own:
         if of_rows.count > 1 and path.suffix.lower() == ".csv":
-            wanted = f"expected .npz or .npy, whose rows {share.count} processes can share"
-            raise InputError(f"{path}: {wanted}, or as many files as processes")
+            raise InputError(
+                f"{path}: expected .npz or .npy, whose rows {share.count} processes can share, or "
+                "as many files as processes"
+            )
         with opened(path, dt) as source:
             last: list[blocks.Block] = []  # the row before the next block
             last_arc = (0, np.empty(2 * source.dim))
@@ -181,8 +195,14 @@ def iterate_pairs(
                     if source.of_pairs_alone:
                         pair, run = run, _arcs_of_pairs(run, z0, z1, *last_arc)
                         along, last_arc = pair - run, (int(run[-1]), z1[-1])
-                    run, own = run + number * FILE_STEP, source.of_pairs(block.own, rows)
-                    yield Pairs(z0, z1, *own, period=source.period, run=run, place=along)
+                    yield Pairs(
+                        z0,
+                        z1,
+                        *source.of_pairs(block.own, rows),
+                        period=source.period,
+                        run=run + number * FILE_STEP,
+                        place=along,
+                    )
 
 
 def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.ndarray:
@@ -207,16 +227,20 @@ def read_initial(
     driven = blocks.TIME in parameters
     with opened(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
-            wanted = f"expected states of {2 * dim} columns (d = {dim})"
-            raise InputError(f"{path}: {wanted}, found {2 * source.dim} columns (d = {source.dim})")
+            raise InputError(
+                f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
+                f"{2 * source.dim} columns (d = {source.dim})"
+            )
         columns = {name: 1 + i for i, name in enumerate(source.parameters)}
         if driven and "t0" in columns:
             columns[blocks.TIME] = columns["t0"]
         elif driven and source.timed:
             columns[blocks.TIME] = 0
         if driven and blocks.TIME not in columns:
-            needed = "expected t0, the time of the drive that the model was learned with"
-            raise InputError(f"{path}: {needed}, beside the states; found none")
+            raise InputError(
+                f"{path}: expected t0, the time of the drive that the model was learned with, "
+                "beside the states; found none"
+            )
         missing = [name for name in parameters if name not in columns]
         if missing:
             raise InputError(

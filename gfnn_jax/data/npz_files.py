@@ -54,8 +54,10 @@ class _StoredArray:
             raise InputError(f"{path}: {name} must hold real numbers, found {self.dtype}{hint}")
         expected = math.prod(self.shape) * self.dtype.itemsize
         if size - stream.tell() != expected:
-            told = f"{expected} bytes expected for shape {self.shape}, {size - stream.tell()} found"
-            raise InputError(f"{path}: {name} is damaged: {told}")
+            raise InputError(
+                f"{path}: {name} is damaged: {expected} bytes expected for shape {self.shape}, "
+                f"{size - stream.tell()} found"
+            )
 
     def whole(self) -> np.ndarray:
         with damage(self.path, self.name):
@@ -108,9 +110,10 @@ class _Archive:
         """The times (count,) of a drive."""
         t0 = np.atleast_1d(self.array("t0").whole().astype(np.float64))
         if t0.shape != (count,) or not np.isfinite(t0).all():
-            rest = "" if np.isfinite(t0).all() else " with NaN or infinity"
-            wanted = f"t0 must be finite, of shape ({count},), found {t0.shape}"
-            raise InputError(f"{self.path}: {wanted}{rest}")
+            raise InputError(
+                f"{self.path}: t0 must be finite, of shape ({count},), found {t0.shape}"
+                + ("" if np.isfinite(t0).all() else " with NaN or infinity")
+            )
         return t0
 
     def parameters(self) -> tuple[tuple[str, ...], np.ndarray | None]:
@@ -129,8 +132,10 @@ class _Archive:
             with damage(self.path, "param_names", *_OF_HEADERS), np.load(self.path) as file:
                 names = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
             if len(names) != values.shape[1] or len(set(names)) < len(names):
-                wanted = f"{values.shape[1]} different names, found {', '.join(names)}"
-                raise InputError(f"{self.path}: param_names must be {wanted}")
+                raise InputError(
+                    f"{self.path}: param_names must be {values.shape[1]} different names, found "
+                    f"{', '.join(names)}"
+                )
         return names, values
 
 
@@ -156,8 +161,10 @@ class _Sequences(NamedTuple):
         array, shape, of_pairs = self.arrays[0], self.arrays[0].shape, len(self.arrays) == 2
         if of_pairs:
             if len(shape) != 2 or shape != self.arrays[1].shape:
-                found = f"found {shape} and {self.arrays[1].shape}"
-                raise InputError(f"{self.path}: z0 and z1 must both have shape (N, 2d), {found}")
+                raise InputError(
+                    f"{self.path}: z0 and z1 must both have shape (N, 2d), found {shape} and "
+                    f"{self.arrays[1].shape}"
+                )
         elif len(shape) not in (2, 3) or (self.each_row and len(shape) != 2):
             wanted = "(B, 2d)" if self.each_row else "(L, 2d) or (M, L, 2d)"
             raise InputError(f"{self.path}: {array.name} must have shape {wanted}, found {shape}")
@@ -169,8 +176,10 @@ class _Sequences(NamedTuple):
         names, values = self.parameters
         if values is not None and len(values) != count:
             what = "pairs" if of_pairs else "states" if self.each_row else "sequences"
-            wanted = f"a row for each of the {count} {what}"
-            raise InputError(f"{self.path}: params must have {wanted}, found {values.shape}")
+            raise InputError(
+                f"{self.path}: params must have a row for each of the {count} {what}, found "
+                f"{values.shape}"
+            )
         if self.lengths is not None:
             _check_lengths(self.path, self.lengths, count, length)
         own = None
@@ -197,9 +206,13 @@ class _Sequences(NamedTuple):
                 if of_pairs:
                     states = np.stack(several, axis=1).reshape(-1, 2 * dim)
                 number = row + np.arange(len(states))
-                given = None if own is None else own[number]
-                places = number // length, number % length
-                block = Block(states, *places, lambda r, c, n=row: locate(n + r, c), given)
+                block = Block(
+                    states,
+                    number // length,
+                    number % length,
+                    lambda r, c, n=row: locate(n + r, c),
+                    None if own is None else own[number],
+                )
                 if self.lengths is not None:
                     kept = block.place < self.lengths[block.sequence]
                     block = block.rows(np.flatnonzero(kept))
@@ -208,9 +221,17 @@ class _Sequences(NamedTuple):
                     yield block
 
         dtypes = [one.dtype for one in self.arrays]
-        precision = str(np.result_type(*dtypes) if of_pairs else dtypes[0])
-        about = names, self.uneven, self.period, self.times is not None, of_pairs
-        return Source(dim, self.dt, blocks, precision, {}, *about)
+        return Source(
+            dim,
+            self.dt,
+            blocks,
+            precision=str(np.result_type(*dtypes) if of_pairs else dtypes[0]),
+            parameters=names,
+            uneven=self.uneven,
+            period=self.period,
+            timed=self.times is not None,
+            of_pairs_alone=of_pairs,
+        )
 
 
 def open_npy(request: Request, stream) -> Source:
@@ -232,9 +253,10 @@ def open_npz(request: Request, stream) -> Source:
     is_pairs = "z0" in archive and "z1" in archive
     if is_pairs == ("trajectories" in archive):
         names = archive.names
-        found = f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
-        wanted = "expected either the arrays z0 and z1, or trajectories"
-        raise InputError(f"{path}: {wanted}; found {found}")
+        raise InputError(
+            f"{path}: expected either the arrays z0 and z1, or trajectories; found "
+            f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
+        )
     further = [name for name in archive.names if name not in _READ]
     if further and "job" not in further:  # other arrays of a prediction are about it
         ignored = f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)"
@@ -243,8 +265,9 @@ def open_npz(request: Request, stream) -> Source:
     if "period" in archive and not request.initial:
         period = check_dt(archive.array("period").whole(), f"{path}: period")
         if not (with_t0 or "times" in archive):
-            wanted = "expected t0, the time of the drive, beside its period; got none"
-            raise InputError(f"{path}: {wanted}")
+            raise InputError(
+                f"{path}: expected t0, the time of the drive, beside its period; got none"
+            )
     elif with_t0 and not request.initial:
         raise InputError(f"{path}: expected the drive's period beside t0, found none")
     dt = archive.array("dt").whole() if "dt" in archive and request.with_times else None
@@ -270,8 +293,10 @@ def _pairs(
         bad = ~(np.isfinite(dt) & (dt > 0))
         if bad.any():
             row = int(np.argmax(bad))
-            told = f"found {int(bad.sum())} that are not, first dt[{row}] = {dt[row]:g}"
-            raise InputError(f"{path}: dt must be finite and above 0, {told}")
+            raise InputError(
+                f"{path}: dt must be finite and above 0, found {int(bad.sum())} that are not, "
+                f"first dt[{row}] = {dt[row]:g}"
+            )
         times = np.stack([np.zeros(len(dt)), dt], axis=1)
     if period is not None:
         t0 = np.mod(archive.t0(z0.shape[0] if z0.shape else 0), period)
@@ -311,8 +336,10 @@ def _times_dt(path, times, shape, lengths) -> float:
     """The time step of ``times`` (M, L), NaN where they are uneven."""
     times = times[None] if times.ndim == 1 else times
     if times.shape != ((1, *shape[:1]) if len(shape) == 2 else shape[:2]):
-        must = "times must have the shape of the trajectories without the last axis"
-        raise InputError(f"{path}: {must}, found {times.shape} beside {shape}")
+        raise InputError(
+            f"{path}: times must have the shape of the trajectories without the last axis, found "
+            f"{times.shape} beside {shape}"
+        )
     steps = np.diff(times, axis=1)
     used = np.ones(steps.shape, bool)
     if lengths is not None and lengths.shape == times.shape[:1]:
@@ -320,8 +347,10 @@ def _times_dt(path, times, shape, lengths) -> float:
     bad = ~(np.isfinite(steps) & (steps > 0)) & used
     if bad.any():
         m, i = (int(k) for k in np.argwhere(bad)[0])
-        row, found = f"times[{m}, {i + 1}]", f"{times[m, i + 1]:g} after {times[m, i]:g}"
-        raise InputError(f"{path}: times must rise, found {row} = {found}")
+        raise InputError(
+            f"{path}: times must rise, found times[{m}, {i + 1}] = {times[m, i + 1]:g} after "
+            f"{times[m, i]:g}"
+        )
     usual = float(np.median(steps[used])) if used.any() else np.nan
     slack = TIME_TOLERANCE * usual + 4 * np.finfo(np.float64).eps * np.abs(times[:, 1:])
     even = bool((np.abs(steps - usual) <= slack)[used].all())
@@ -340,8 +369,10 @@ def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
 
 def _check_lengths(path, lengths: np.ndarray, count: int, longest: int) -> None:
     if lengths.shape != (count,) or lengths.dtype.kind not in "iu":
-        found = f"found {lengths.dtype} of shape {lengths.shape}"
-        raise InputError(f"{path}: lengths must be integers of shape ({count},), {found}")
+        raise InputError(
+            f"{path}: lengths must be integers of shape ({count},), found {lengths.dtype} of shape "
+            f"{lengths.shape}"
+        )
     bad = np.flatnonzero((lengths < 1) | (lengths > longest))
     if len(bad):
         first = f"first lengths[{bad[0]}] = {lengths[bad[0]]}"

@@ -79,10 +79,15 @@ class PredictionJob:
     @property
     def record(self) -> dict[str, Any]:
         """The request as a file can hold it."""
-        shape = [self.shape[0], len(self.steps), self.shape[1]]
-        job = {**self.identity, "format": OPTIONS.format, "shape": shape}
-        job |= {"bands": True} if self.bands else {}
-        job |= {"num_steps": self.num_steps, "save_every": self.save_every, "dt": float(self.dt)}
+        job = {
+            **self.identity,
+            "format": OPTIONS.format,
+            "shape": [self.shape[0], len(self.steps), self.shape[1]],
+            **({"bands": True} if self.bands else {}),
+            "num_steps": self.num_steps,
+            "save_every": self.save_every,
+            "dt": float(self.dt),
+        }
         return json.loads(json.dumps(job))  # as it will be read back
 
 
@@ -144,8 +149,10 @@ class PredictionWriter:
             return
         outputs.ensure_new(self.out, overwrite)
         if self.partial.exists() and not (overwrite or resume):
-            told = "an unfinished prediction (--resume goes on with it, --overwrite discards it)"
-            raise InputError(f"{self.partial}: {told}")
+            raise InputError(
+                f"{self.partial}: an unfinished prediction (--resume goes on with it, --overwrite "
+                "discards it)"
+            )
         with outputs.failures_as_work_errors(self.out):
             self._discard()
             self.partial.mkdir(parents=True)
@@ -162,8 +169,10 @@ class PredictionWriter:
         stop = self.saved + (states.shape[1] if states.ndim == 3 else 0)
         expected = (self.lanes, stop - self.saved, self.width)
         if states.shape != expected or not self.saved < stop <= self.total:
-            wanted = f"({self.lanes}, at most {self.total - self.saved}, {self.width})"
-            raise ValueError(f"expected states {wanted}, got {states.shape}")
+            raise ValueError(
+                f"expected states ({self.lanes}, at most {self.total - self.saved}, {self.width}), "
+                f"got {states.shape}"
+            )
         carry = {name: np.asarray(value) for name, value in carry.items()}
         if any(value.dtype.hasobject for value in carry.values()):
             raise TypeError("the carry must be arrays of numbers")
@@ -198,9 +207,13 @@ class PredictionWriter:
             raise ValueError(f"{self.saved} of {self.total} states are there")
         status = np.asarray(status).astype(np.int64).reshape(self.lanes)
         left_at = np.asarray(left_at).astype(np.int64).reshape(self.lanes)
-        arrays = {name: np.asarray(value) for name, value in more.items()}
-        arrays |= {"status": status, "left_at": left_at, "dt": np.asarray(float(self.asked.dt))}
-        arrays["job"] = np.asarray(digest_of(self._job))
+        arrays = {
+            **{name: np.asarray(value) for name, value in more.items()},
+            "status": status,
+            "left_at": left_at,
+            "dt": np.asarray(float(self.asked.dt)),
+            "job": np.asarray(digest_of(self._job)),
+        }
         if self.asked.params is not None:
             names, values = self.asked.params
             arrays |= {"params": values, "param_names": np.array(names)}
@@ -277,14 +290,18 @@ class PredictionWriter:
         self._overwrite = self._overwrite or began.get("overwrite") is True
         for key in {**job, **self._job}:
             if job.get(key) != self._job.get(key):
-                differs = f"{key} is {job.get(key)} there and {self._job.get(key)} here"
-                told = f"belongs to another prediction: {differs}. --overwrite discards it"
-                raise InputError(f"{self.partial}: {told}")
+                raise InputError(
+                    f"{self.partial}: belongs to another prediction: {key} is {job.get(key)} there "
+                    f"and {self._job.get(key)} here. --overwrite discards it"
+                )
         for line in lines[1:]:
             carry = self._verified_carry(line)
             if carry is None:
-                told = f"{self.partial}: a chunk is damaged or half written: going on from saved"
-                warnings.warn(f"{told} state {self.saved} instead", stacklevel=3)
+                warnings.warn(
+                    f"{self.partial}: a chunk is damaged or half written: going on from saved "
+                    f"state {self.saved} instead",
+                    stacklevel=3,
+                )
                 break
             entry = json.loads(line)
             self._chunks.append(entry)
@@ -346,9 +363,10 @@ def number_of_parts(out: Path, share: Share, *, resume: bool) -> int:
     if there == {share.count}:
         return share.count
     found = " and of ".join(map(str, sorted(there)))
-    told = f"{out}: unfinished parts by {found} processes are there, and this job has {share.count}"
-    way = "delete those of one kind" if resume else "--resume goes on with them, or delete them"
-    raise InputError(f"{told}: {way}")
+    raise InputError(
+        f"{out}: unfinished parts by {found} processes are there, and this job has {share.count}: "
+        + ("delete those of one kind" if resume else "--resume goes on with them, or delete them")
+    )
 
 
 def put_together(parts: Sequence[Path], out: Path, job: dict[str, Any]) -> None:

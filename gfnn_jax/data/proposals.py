@@ -82,9 +82,13 @@ def _states(traits: Traits) -> Iterator[Fault]:
     populations = all((x > 0).all() for x in runs)
     what = "of populations" if populations else "of the rates of a body that turns"
     keeps = f", and each run keeps {found.constants} of these" * (found.constants > 0)
-    found = f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}"
-    options = {"structure": "poisson", "states": names}
-    yield Fault("first order", f"{found}: these are not positions", "Learn their bracket:", options)
+    yield Fault(
+        "first order",
+        f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}: these are "
+        "not positions",
+        "Learn their bracket:",
+        {"structure": "poisson", "states": names},
+    )
 
 
 # Points that a rod or a string holds.
@@ -272,8 +276,10 @@ def _hands(traits: Traits) -> Iterator[Fault]:
     begin, end = _let_go(traits), _caught(traits)
     if begin is not None:
         shown = float(f"{begin / second:.6g}")
-        found = f"the motion begins at rest and is free from {shown:g} on at the earliest: before"
-        found += " it something moves the body that no column shows"
+        found = (
+            f"the motion begins at rest and is free from {shown:g} on at the earliest: before it "
+            "something moves the body that no column shows"
+        )
         yield Fault("let go", found, "To begin there:", {"start": shown})
     if end is not None:
         shown = float(f"{end / second:.6g}")

@@ -226,32 +226,53 @@ class Recording:
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
-        given_angles = angles or (), names_of["degrees"], angles is None
-        known = {**roles, "positions": coordinate_names}
-        angular, radians = angles_of(source, known, *given_angles, units)
+        angular, radians = angles_of(
+            source,
+            {**roles, "positions": coordinate_names},
+            angles or (),
+            names_of["degrees"],
+            angles is None,
+            units,
+        )
         factors = {name: radians.get(name, 1.0) for name in numbers}
         factors |= {of: factors[name] for name, of in sigmas.items()}
-        by_run = ((run, of_run.items()) for run, (_, of_run) in runs.items())
-        values = {run: {n: column * factors[n] for n, column in items} for run, items in by_run}
-        for what in ("std", "offset", "scale"):
-            check_known(source, what, std if what == "std" else names_of[what], with_role)
+        values = {
+            run: {name: column * factors[name] for name, column in of_run.items()}
+            for run, (_, of_run) in runs.items()
+        }
+        for what, wanted in (
+            ("std", std),
+            ("offset", names_of["offset"]),
+            ("scale", names_of["scale"]),
+        ):
+            check_known(source, what, wanted, with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)
         about_times = (*(second_times(tables) if dt is None else ()), *restarts(tables, runs))
-        guess, words = options.get("guess") or {}, [n for t in tables for n in t.text]
-        known: dict[str, Any] = {**roles, "runs": tuple(runs), "source": source, "factors": factors}
-        known |= {"angles": angular, "coordinates": coordinate_names, "observe": dict(observe)}
-        known |= {"std": typical(std, sigmas, with_role, factors, values)}
-        known |= {"guess": {name: float(value) for name, value in guess.items()}}
-        known |= {"units": {n: u for n, u in units.items() if n in numbers}}
-        known |= {"time_unit": unit, "time_unit_given": told is not None}
-        known |= {"offsets": names_of["offset"], "scales": names_of["scale"]}
-        unused = [n for n in numbers if n not in with_role]
-        known |= {"ignored": (*unused, *dict.fromkeys(words))}
-        known |= {"angles_given": angles is not None or options.get("degrees") is not None}
-        known |= {"notes": (*(n for t in tables for n in t.notes), *about_times, *decided)}
-        known |= {"_times": {run: times for run, (times, _) in runs.items()}}
-        vars(self).update(known, _values=values, _sigmas=sigmas)
+        fields = {
+            **roles,
+            "runs": tuple(runs),
+            "angles": angular,
+            "std": typical(std, sigmas, with_role, factors, values),
+            "coordinates": coordinate_names,
+            "observe": dict(observe),
+            "guess": {name: float(value) for name, value in (options.get("guess") or {}).items()},
+            "units": {n: u for n, u in units.items() if n in numbers},
+            "factors": factors,
+            "time_unit": unit,
+            "time_unit_given": told is not None,
+            "offsets": names_of["offset"],
+            "scales": names_of["scale"],
+            "ignored": tuple(n for n in numbers if n not in with_role)
+            + tuple(dict.fromkeys(n for t in tables for n in t.text)),
+            "angles_given": angles is not None or options.get("degrees") is not None,
+            "notes": (*(n for t in tables for n in t.notes), *about_times, *decided),
+            "source": source,
+            "_times": {run: times for run, (times, _) in runs.items()},
+            "_values": values,
+            "_sigmas": sigmas,
+        }
+        vars(self).update(fields)
         for run in self.runs:
             for array in (self._times[run], *self._values[run].values()):
                 array.flags.writeable = False
@@ -513,9 +534,10 @@ def parameters_of(recording: Recording) -> tuple[str, ...]:
         columns = recording.each(recording.values, name)
         for run, column in zip(recording.runs, columns, strict=True):
             if not (np.isfinite(column).all() and np.ptp(column) == 0):
-                told = f"parameter {name} is not one number in run {run}"
-                advice = "Name what changes within a run an input: --inputs"
-                raise InputError(f"{recording.source}: {told}. {advice}")
+                raise InputError(
+                    f"{recording.source}: parameter {name} is not one number in run {run}. Name "
+                    "what changes within a run an input: --inputs"
+                )
         if len({float(column[0]) for column in columns}) > 1:
             found.append(name)
     return tuple(found)

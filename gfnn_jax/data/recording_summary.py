@@ -104,20 +104,31 @@ class RecordingSummary:
     def as_json(self) -> dict[str, Any]:
         """The figures as plain data: runs, dt_median, gaps, columns, loss_per_period, command, and
         what else the screen shows."""
-        plain: dict[str, Any] = {"source": self.source, "runs": list(self.runs)}
-        plain["samples"] = {run: count for run, (count, _, _) in self.runs.items()}
-        plain |= {"dt_median": self.dt_median, "dt_range": [self.steps[0], self.steps[2]]}
-        plain["gaps"] = [{"run": run, "begin": a, "end": b} for run, a, b in self.gaps]
-        facts = [dict(vars(column)) for column in self.columns]
-        plain["columns"] = {of.pop("name"): of for of in facts}
-        plain |= {"period": self.period, "dt_resolved": self.coarsest, "loss_per_period": None}
-        plain |= {"loss_std": None, "friction": None}
-        if (loss := self.loss) is not None:
-            plain |= {"loss_per_period": loss.per_period, "loss_std": loss.error}
-            plain["friction"] = (loss.kind or "seen") if loss.significant else None
-        told = ("kind", "message", "remedy", "wrong")
-        plain["faults"] = [{name: getattr(f, name) for name in told} for f in self.faults]
-        return finite({**plain, "options": dict(self.options), "command": self.command})
+        loss = self.loss
+        plain = {
+            "source": self.source,
+            "runs": list(self.runs),
+            "samples": {run: count for run, (count, _, _) in self.runs.items()},
+            "dt_median": self.dt_median,
+            "dt_range": [self.steps[0], self.steps[2]],
+            "gaps": [{"run": run, "begin": a, "end": b} for run, a, b in self.gaps],
+            "columns": {
+                column.name: {key: of for key, of in vars(column).items() if key != "name"}
+                for column in self.columns
+            },
+            "period": self.period,
+            "dt_resolved": self.coarsest,
+            "loss_per_period": None if loss is None else loss.per_period,
+            "loss_std": None if loss is None else loss.error,
+            "friction": None if loss is None or not loss.significant else (loss.kind or "seen"),
+            "faults": [
+                {"kind": f.kind, "message": f.message, "remedy": f.remedy, "wrong": f.wrong}
+                for f in self.faults
+            ],
+            "options": dict(self.options),
+            "command": self.command,
+        }
+        return finite(plain)
 
     @property
     def read_as(self) -> str:
@@ -188,13 +199,21 @@ def summarise(
     files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
     windows = [known.noise[name].size for name in recording.positions]
     coarsest = known.step * max(min(windows) // _Shown.window, 1) if windows else None
-    steps_of = float(between.min()), known.step, float(between.max())
-    empty = tuple((recording.runs[r], a, b) for r, a, b in holes)
-    columns = tuple(_column(known, name, doubted) for name in known.columns)
-    command = f"gfnn fit {files}{as_typed(typed)} --out model"
-    of_motion = columns, period, coarsest, loss, bool(recording.inputs)
-    told = recording.source, counts, steps_of, empty, *of_motion, found, typed
-    return RecordingSummary(*told, command, recording.clock)
+    return RecordingSummary(
+        recording.source,
+        counts,
+        (float(between.min()), known.step, float(between.max())),
+        tuple((recording.runs[r], a, b) for r, a, b in holes),
+        tuple(_column(known, name, doubted) for name in known.columns),
+        period,
+        coarsest,
+        loss,
+        bool(recording.inputs),
+        found,
+        typed,
+        f"gfnn fit {files}{as_typed(typed)} --out model",
+        recording.clock,
+    )
 
 
 def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
@@ -356,11 +375,18 @@ def _columns(summary: RecordingSummary) -> Table:
     for head in ("column", "role", "from", "to", "unit", "resolution", "noise σ", "Hz", "remarks"):
         table.add_column(head, justify="right" if head in ("from", "to", "noise σ") else "left")
     for column in summary.columns[: 2 * _Shown.most]:
-        ends, small = (column.low, column.high), (column.resolution, column.sigma)
-        cells = [column.name, column.role, *(f"{x:.4g}" for x in ends), column.unit]
-        cells += [*map(_digits, small), " ".join(f"{f:.3g}" for f in column.frequencies)]
-        style = "dim" if column.role == "ignored" else None
-        table.add_row(*cells, _remarks(column), style=style)
+        table.add_row(
+            column.name,
+            column.role,
+            f"{column.low:.4g}",
+            f"{column.high:.4g}",
+            column.unit,
+            _digits(column.resolution),
+            _digits(column.sigma),
+            " ".join(f"{f:.3g}" for f in column.frequencies),
+            _remarks(column),
+            style="dim" if column.role == "ignored" else None,
+        )
     return table
 
 

@@ -78,9 +78,20 @@ def read_sample(
     states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     each = float(found["dt"][0]) if same and len(states) else found["dt"]
-    pairs = np.full(len(found["pairs"]), 2), each, files.named(paths), digest, precision, units
-    of_rows = found["run"], found["place"], int(total)
-    return files.TrajectoryData(states, *pairs, args or None, period, *of_rows)
+    return files.TrajectoryData(
+        states,
+        np.full(len(found["pairs"]), 2),
+        each,
+        files.named(paths),
+        digest,
+        precision,
+        units,
+        args or None,
+        period,
+        found["run"],
+        found["place"],
+        int(total),
+    )
 
 
 def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:
@@ -113,8 +124,10 @@ def _both(one: dict[str, np.ndarray] | None, other: dict[str, np.ndarray]) -> di
         return one or other
     shapes = [{name: column.shape[1:] for name, column in table.items()} for table in (one, other)]
     if shapes[0] != shapes[1]:
-        same = "expected files with the same coordinates and parameters"
-        raise InputError(f"{same}, and all with sequences or none, got files that differ")
+        raise InputError(
+            "expected files with the same coordinates and parameters, and all with sequences or "
+            "none, got files that differ"
+        )
     return {name: np.concatenate([column, other[name]]) for name, column in one.items()}
 
 

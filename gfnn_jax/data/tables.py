@@ -74,8 +74,9 @@ def _kept(table: Table, keep: np.ndarray) -> Table:
     columns = {n: v[keep] for n, v in table.columns.items()}
     text = {n: v[keep] if len(v) else v for n, v in table.text.items()}
     places = np.flatnonzero(keep)
-    kept = dataclasses.replace(table, columns=columns, text=text)
-    return dataclasses.replace(kept, locate=lambda row: table.locate(int(places[row])))
+    return dataclasses.replace(
+        table, columns=columns, text=text, locate=lambda row: table.locate(int(places[row]))
+    )
 
 
 def with_events(table: Table, names: Collection[str]) -> Table:
@@ -165,9 +166,10 @@ def from_arrays(path: Path, columns: Sequence[str]) -> Table:
                 loaded = dict(archive.items())
     if isinstance(loaded, np.ndarray) and not loaded.dtype.names:
         if loaded.ndim != 2 or loaded.shape[1] != len(columns):
-            got = f"got {len(columns)} names for shape {loaded.shape}"
-            wanted = "expected --columns with the names of the columns of an array (T, k)"
-            raise InputError(f"{path}: {wanted}, {got}")
+            raise InputError(
+                f"{path}: expected --columns with the names of the columns of an array (T, k), got "
+                f"{len(columns)} names for shape {loaded.shape}"
+            )
         loaded = dict(zip(columns, loaded.T, strict=True))
     return dataclasses.replace(from_memory(loaded), source=str(path))
 
@@ -318,9 +320,11 @@ def _check_places(table: Table, name: str, falls: np.ndarray) -> None:
         before, behind = times[begin:row], times[row : row + _MOST_MOVED + 1]
         goes_on = before[-_MOST_MOVED - 1 :].min() < times[row] or behind.max() > before[-1]
         if before[0] < times[row] and goes_on:
-            back = f"{name} = {times[row]:.9g} runs back from {times[row - 1]:.9g} and goes on from"
-            mended = "there: sort the rows, or number the runs in a column run"
-            raise InputError(f"{table.source}: {table.locate(int(row))}: {back} {mended}")
+            raise InputError(
+                f"{table.source}: {table.locate(int(row))}: {name} = {times[row]:.9g} runs back "
+                f"from {times[row - 1]:.9g} and goes on from there: sort the rows, or number the "
+                "runs in a column run"
+            )
         begin = int(row)
 
 
@@ -336,6 +340,7 @@ def _check_times(table: Table, name: str, rows: np.ndarray) -> None:
         same = times[at + 1] == times[at]
         what = "is the same as" if same else "runs back from"
         remedy = "keep one row of each time" if same else "number the runs in a column run"
-        found = f"{name} = {times[at + 1]:.9g} {what} {times[at]:.9g} before it"
-        found = f"{table.locate(row)}: {found} ({len(falls)} such rows): {remedy}"
-        raise InputError(f"{table.source}: {found}")
+        raise InputError(
+            f"{table.source}: {table.locate(row)}: {name} = {times[at + 1]:.9g} {what} "
+            f"{times[at]:.9g} before it ({len(falls)} such rows): {remedy}"
+        )

@@ -86,8 +86,10 @@ class TextFile:
         cells = [self._cells(line) for _, line in of_file]
         first = self._first_row(cells)
         if first is None:
-            told = f"{path}: expected rows of numbers below a line of names"
-            raise InputError(f"{told}, found {_shown(of_file[: _Options.shown])}")
+            raise InputError(
+                f"{path}: expected rows of numbers below a line of names, found "
+                f"{_shown(of_file[: _Options.shown])}"
+            )
         self._first = of_file[first][0] - 1  # lines before the first row of numbers
         rows, above = cells[first:], cells[:first]
         # A blank line ends what instruments write above the names.
@@ -96,26 +98,30 @@ class TextFile:
             above = above[gaps[-1] :]
         commented = not above and self._comment  # np.savetxt writes the header as a comment
         if commented:
-            own = [line.lstrip() for i, line in numbered if i <= self._first]
-            own = [line for line in own if line.startswith(commented)][-1:]
-            above = [self._cells(line.lstrip(commented).strip()) for line in own]
+            above = [
+                self._cells(line.lstrip().lstrip(commented).strip())
+                for i, line in numbered
+                if i <= self._first and line.lstrip().startswith(commented)
+            ][-1:]
         width = len(rows[0])
         if not any(row[-1] for row in rows) and not any(any(c[width - 1 :]) for c in above):
             width -= 1  # a separator ends every line
         above = [one if any(one[width:]) else one[:width] for one in above]
         if above[-1:] and len(above[-1]) > 1 and not any(len(one) == width for one in above):
-            wanted = f"{len(above[-1])} columns expected ({', '.join(above[-1])[:60]})"
-            raise InputError(f"{path}: line {of_file[first][0]}: {wanted}, {width} found")
+            raise InputError(
+                f"{path}: line {of_file[first][0]}: {len(above[-1])} columns expected "
+                f"({', '.join(above[-1])[:60]}), {width} found"
+            )
         self.step = self._step(cells[:first])
         self.runs: dict[str, tuple[str, str]] = {}
         self.names, self.units = self._header(above, width, columns)
         known = [[row[i] for row in rows if i < len(row)] for i in range(width)]
         held = [[c for c in of if c.lower() not in _MISSING] for of in known]
-        of_each = zip(self.names, held, strict=True)
-        numeric = {n: sum(_is_number(c, self._decimal) for c in of) for n, of in of_each}
-        of_each = zip(self.names, held, strict=True)
-        words = (n for n, of in of_each if not is_run(n) and 2 * numeric[n] < len(of))
-        self.text = tuple(words)
+        self.text = tuple(
+            name
+            for name, of in zip(self.names, held, strict=True)
+            if not is_run(name) and 2 * sum(_is_number(c, self._decimal) for c in of) < len(of)
+        )
         self.times = self._times(dict(zip(self.names, held, strict=True)), time)
         # Words of a file in which the time is told by dates: (how they are read, s in their unit).
         self._dates: tuple[Callable[[Any], Any], float] | None = None
@@ -190,9 +196,10 @@ class TextFile:
         elif len(columns) == width:
             names, units = list(columns), {}
         else:
-            names = f"--columns {','.join(['t', 'x', 'v', 'u', 'a', 'b'][:width])}"
-            wanted = f"expected a line of names above {width} columns of numbers"
-            raise InputError(f"{self.path}: {wanted}, found none; name them: {names}")
+            raise InputError(
+                f"{self.path}: expected a line of names above {width} columns of numbers, found "
+                f"none; name them: --columns {','.join(['t', 'x', 'v', 'u', 'a', 'b'][:width])}"
+            )
         repeated = [name for name in dict.fromkeys(names) if names.count(name) > 1]
         if repeated:
             raise InputError(f"{self.path}: the header names {', '.join(repeated)} twice")
@@ -244,10 +251,19 @@ class TextFile:
 
         names = [*self.names, _BEYOND]
         words = {n for n in names if n not in wanted or n in self.text or n in as_text}
-        options: dict[str, Any] = {"header": None, "index_col": False, "skipinitialspace": True}
-        options |= {"sep": self._separator, "decimal": self._decimal, "comment": self._comment}
-        options |= {"names": names, "dtype": {n: str if n in words else np.float64 for n in names}}
-        options |= {"skiprows": self._first, "chunksize": rows, "na_values": list(_MISSING)}
+        options: dict[str, Any] = {
+            "sep": self._separator,
+            "decimal": self._decimal,
+            "comment": self._comment,
+            "header": None,
+            "names": names,
+            "dtype": {n: str if n in words else np.float64 for n in names},
+            "skiprows": self._first,
+            "chunksize": rows,
+            "na_values": list(_MISSING),
+            "skipinitialspace": True,
+            "index_col": False,
+        }
         last, begin = self.names[-1], None
         try:
             with self._open() as stream, pd.read_csv(stream, **options) as blocks:
@@ -310,8 +326,10 @@ class TextFile:
             spread = float(np.std(steps)) if len(steps) else 0.0
             found.append((spread, float(np.median(steps)), way))
         if not found:
-            expected = f"{self.path}: {self.times[0]}: expected times like 2024-05-01 23:59:59.5"
-            raise InputError(f"{expected} ({reason})")
+            raise InputError(
+                f"{self.path}: {self.times[0]}: expected times like 2024-05-01 23:59:59.5 "
+                f"({reason})"
+            )
         _, step, way = min(found, key=lambda one: one[0])
         second = 24 * 3600.0 if step >= _Options.daily else 1.0
         unit = "s" if second == 1 else "d"
@@ -327,8 +345,9 @@ class TextFile:
             return self._dates[0](_cleaned(joined))
         except ValueError as error:
             reason = str(error).split(" You might")[0][:120]
-            what = f"{self.path}: {self.times[0]}: expected times like the first of them"
-            raise InputError(f"{what} ({reason})") from None
+            raise InputError(
+                f"{self.path}: {self.times[0]}: expected times like the first of them ({reason})"
+            ) from None
 
     def _is_data(self, cells: list[str]) -> bool:
         """Return whether at least half of a line's cells are numbers."""
@@ -363,23 +382,29 @@ class TextFile:
         found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, cells = found[0]
-            told = f"({', '.join(self.names)[:60]}), {len(cells)} found"
-            expected = f"{count} columns expected {told}"
-            more = _more([(n, ", ".join(c)) for n, c in found])
-            raise InputError(f"{self.path}: line {number}: {expected}{more}")
+            raise InputError(
+                f"{self.path}: line {number}: {count} columns expected "
+                f"({', '.join(self.names)[:60]}), {len(cells)} found"
+                f"{_more([(n, ', '.join(c)) for n, c in found])}"
+            )
 
     def _check_numbers(self, columns: Sequence[str]) -> None:
         """Raises InputError at the first cells of these columns that are no numbers."""
-        cells = ((n, *one) for n, of in self._rows() for one in zip(self.names, of, strict=False))
-        cells = (one for one in cells if one[1] in columns)
-        wrong = (one for one in cells if not _is_number(one[2], self._decimal))
+        wrong = (
+            (number, name, cell)
+            for number, cells in self._rows()
+            for name, cell in zip(self.names, cells, strict=False)
+            if name in columns and not _is_number(cell, self._decimal)
+        )
         found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, name, cell = found[0]
             others = ",".join(n for n in self.names if n != name and n not in self.text)
-            what = f"{self.path}: line {number}, {name}: {cell[:40]!r} is not a number"
-            more = _more([(n, f"{name} {cell}") for n, name, cell in found])
-            raise InputError(f"{what}{more}. Without that column: --columns {shlex.quote(others)}")
+            raise InputError(
+                f"{self.path}: line {number}, {name}: {cell[:40]!r} is not a number"
+                f"{_more([(n, f'{name} {cell}') for n, name, cell in found])}. "
+                f"Without that column: --columns {shlex.quote(others)}"
+            )
 
 
 def from_text(
@@ -420,9 +445,16 @@ def from_text(
     of_words = {name: found.pop(name, np.array([], str)) for name in words_of}
     aside = [name for name, cells in of_words.items() if not {*words} & {*cells}]
     row_numbers = np.concatenate(numbers)
-    time, notes = next(iter(text.times), None), (*text.notes, *_put_aside(aside))
-    told = str(path), of_words, notes, lambda row: text.locate(int(row_numbers[row]))
-    return Table(found, text.units, *told, time, text.step)
+    return Table(
+        found,
+        text.units,
+        str(path),
+        of_words,
+        (*text.notes, *_put_aside(aside)),
+        lambda row: text.locate(int(row_numbers[row])),
+        next(iter(text.times), None),
+        text.step,
+    )
 
 
 def _put_aside(names: Sequence[str]) -> tuple[str, ...]:
@@ -447,10 +479,14 @@ def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
     found = pd.concat(parts)
     time = text.runs[text.times[0]][0] if text.times else None
     kept = [str(n) for n in found if not columns or n in (*columns, time, "run")]
-    named, units = {n: found[n].to_numpy() for n in kept}, text.units.items()
-    units = {text.runs[name][0]: unit for name, unit in units}
-    notes = (*text.notes, *_put_aside(aside), f"the runs {', '.join(runs)} stand side by side")
-    return Table(named, units, str(text.path), {}, notes, time=time)
+    return Table(
+        {name: found[name].to_numpy() for name in kept},
+        {text.runs[name][0]: unit for name, unit in text.units.items()},
+        str(text.path),
+        {},
+        (*text.notes, *_put_aside(aside), f"the runs {', '.join(runs)} stand side by side"),
+        time=time,
+    )
 
 
 def to_text(columns: Mapping[str, np.ndarray]) -> str:
@@ -515,9 +551,10 @@ def _dialect(path: Path, lines: list[str]) -> tuple[str, str]:
     share, separator, decimal = max(good, key=lambda found: found[0])
     header = _cells(lines[0], ",")
     if separator == "," and len(_cells(sample[0], ",")) == 2 * len(header) > 2 and share == 1:
-        told = "commas between columns and decimal commas cannot be distinguished"
-        advice = "write semicolons between columns, or decimal points"
-        raise InputError(f"{path}: {told}: {advice}")
+        raise InputError(
+            f"{path}: commas between columns and decimal commas cannot be distinguished: write "
+            "semicolons between columns, or decimal points"
+        )
     return separator, decimal
 
 
@@ -526,10 +563,13 @@ def _titled(titles: list[str], names: list[str]) -> tuple[list[str], tuple[str, 
     if len(set(names)) == len(names) or len(titles) != len(names):
         return names, ()
     spread = list(itertools.accumulate(titles, lambda before, title: title or before))
-    told = zip(spread, names, strict=True)
-    bodies = list(dict.fromkeys(t for t, n in told if names.count(n) > 1))
-    told = zip(spread, names, strict=True)
-    found = [f"{n}{bodies.index(t) + 1}" if names.count(n) > 1 else n for t, n in told]
+    bodies = list(
+        dict.fromkeys(t for t, n in zip(spread, names, strict=True) if names.count(n) > 1)
+    )
+    found = [
+        f"{n}{bodies.index(t) + 1}" if names.count(n) > 1 else n
+        for t, n in zip(spread, names, strict=True)
+    ]
     return found, (f"the columns 1, 2 … are of {', '.join(bodies)}",)
 
 

@@ -217,8 +217,14 @@ def accelerations(traits: Traits, inputs: Sequence[str]) -> Accelerations | None
     if fits is None:
         return None
     dim = len(names)
-    known = fits.values[:dim], fits.slopes[:dim], fits.curvatures[:dim], fits.values[dim:]
-    found = Accelerations(*known, fits.run, fits.centres)
+    found = Accelerations(
+        fits.values[:dim],
+        fits.slopes[:dim],
+        fits.curvatures[:dim],
+        fits.values[dim:],
+        fits.run,
+        fits.centres,
+    )
     every = np.concatenate([found.q, found.v, found.a, found.u])
     known = np.asarray(np.isfinite(every).all(axis=0))
     return found.taken(known) if known.sum() >= 2 * _Options.block else None

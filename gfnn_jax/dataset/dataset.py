@@ -71,9 +71,11 @@ class Dataset:
         before, after = (to_inner(coordinates, z) for z in (pairs.z0, pairs.z1))
         known = np.isfinite(before + after).all(axis=1)
         if not known.all():
-            count, first = int((~known).sum()), int(np.argmin(known))
-            told = f"{count} pairs have no {coordinates.name} coordinates of the scene, the first"
-            raise FitError(f"{told} number {first}, from 0. Leave them out, or fit without --scene")
+            raise FitError(
+                f"{int((~known).sum())} pairs have no {coordinates.name} coordinates of the scene, "
+                f"the first is number {int(np.argmin(known))}, from 0. Leave them out, or fit "
+                "without --scene"
+            )
         lifted = lift if structure is None or not structure.angles else lift_sites
         y0, y1, centres, covered = lifted(before, after, coordinates)
         whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
@@ -217,9 +219,14 @@ class Dataset:
 
     def take(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, each in its part; sizes and domain are theirs."""
-        own = {"row": self.row[rows], "y0": self.y0[rows], "y1": self.y1[rows]}
-        parts = {"pairs": self.pairs.take(rows), "split": self.split.take(rows)}
-        return dataclasses.replace(self, **own, **parts)._measured()
+        return dataclasses.replace(
+            self,
+            pairs=self.pairs.take(rows),
+            row=self.row[rows],
+            y0=self.y0[rows],
+            y1=self.y1[rows],
+            split=self.split.take(rows),
+        )._measured()
 
     def lifted_anew(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, their angles lifted among themselves, nothing factored out and all

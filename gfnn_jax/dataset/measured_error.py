@@ -91,8 +91,10 @@ class Tolerance:
 
     def missed_by(self, candidate: Any, ended: str) -> str:
         """The warning that nothing meets it, which came nearest, and why the search ended."""
-        told = f"{candidate.label}, has {self.text_of(candidate)} and the search ended because"
-        return f"no candidate meets the tolerance {self.bound:g}: the most accurate, {told} {ended}"
+        return (
+            f"no candidate meets the tolerance {self.bound:g}: the most accurate, {candidate.label}"
+            f", has {self.text_of(candidate)} and the search ended because {ended}"
+        )
 
 
 class OneStepError(NamedTuple):

@@ -153,8 +153,9 @@ def of_halves(residual: np.ndarray, grown: np.ndarray) -> np.ndarray:
     """
     halves = np.arange(residual.shape[1]) // (residual.shape[1] // 2)
     mean = np.array([np.mean(residual[:, halves == half] ** 2) for half in (0, 1)])
-    own = [[np.mean(grown[by][:, halves == half]) for by in (0, 1)] for half in (0, 1)]
-    factors = np.array(own) + np.eye(2)
+    factors = np.array(
+        [[np.mean(grown[by][:, halves == half]) for by in (0, 1)] for half in (0, 1)]
+    ) + np.eye(2)
     # In units of each half's own residual, as q and p may differ by orders of magnitude.
     relative = factors * mean / mean[:, None]
     rows = np.concatenate([relative, _PRIOR * np.eye(2)])

@@ -290,9 +290,10 @@ def stretches(
     found = [dataclasses.replace(part, even=False) for s in whole for part in s.cut(gap)]
     found = [s for s in found if np.all(np.isfinite(s.q).sum(0) >= FEWEST)]
     if not found:
-        step = f"(a step above {gap:g} times the median is a gap)"
-        wanted = f"no run has {FEWEST} readings of each position in a row {step}"
-        raise FitError(f"{recording.source}: {wanted}")
+        raise FitError(
+            f"{recording.source}: no run has {FEWEST} readings of each position in a row (a step "
+            f"above {gap:g} times the median is a gap)"
+        )
     return found
 
 
@@ -385,7 +386,9 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
     """σ (k,) of channels, each where it was seen."""
     sigma = []
     for k in range(found[0].y.shape[1]):
-        known = [(s.t[own], s.y[own, k : k + 1]) for s in found for own in [~np.isnan(s.y[:, k])]]
+        known = [
+            (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
+        ]
         if not any(y.any() for _, y in known):  # of events
             sigma.append(0.0)
         elif all(s.even for s in found):

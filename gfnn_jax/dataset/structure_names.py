@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import re
 
-STRUCTURES = ("poisson", "ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS")
-STRUCTURES += ("bodies:N:SPECIES",)
+STRUCTURES = (
+    "poisson",
+    "ring",
+    "chain",
+    "bodies:N",
+    "ring:FIELDS",
+    "chain:FIELDS",
+    "bodies:N:SPECIES",
+)
 EXPECTED = f"a structure among {', '.join(STRUCTURES)} (one alone)"
 _SITES, _BODIES = r"(ring|chain)(:[1-9][0-9]?)?", r"bodies:0*([2-9]|[1-9][0-9]+)(:[A-Za-z]+)?"
 

@@ -159,12 +159,15 @@ def structure_of(
     if known is not None:
         count, species = known
         if species and len(species) != count:
-            names = f"bodies:{count}:{('a' + 'b' * count)[:count]}"
-            wanted = f"expected a letter for each of {count} bodies, as {names}"
-            raise FitError(f"{wanted}; got {len(species)} in {text!r}")
+            raise FitError(
+                f"expected a letter for each of {count} bodies, as bodies:{count}:"
+                f"{('a' + 'b' * count)[:count]}; got {len(species)} in {text!r}"
+            )
         if dim % count or not 1 <= dim // count <= 3:
-            which = f"{count}, {2 * count} or {3 * count} degrees of freedom; got {dim}"
-            raise FitError(f"expected {count} bodies in 1 to 3 dimensions, which have {which}")
+            raise FitError(
+                f"expected {count} bodies in 1 to 3 dimensions, which have {count}, {2 * count} or "
+                f"{3 * count} degrees of freedom; got {dim}"
+            )
         return Bodies(count, dim // count, species)
     kind, fields = str(text).partition(":")[0], fields_of(str(text))
     if fields == 0:
@@ -175,8 +178,10 @@ def structure_of(
         raise FitError(f"expected {Options.fewest_sites} sites or more, got {dim // fields}")
     sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
     if coordinates.angles not in sides:
-        wanted = f"all q of the sites (0 to {dim - 1}), or all q and p (0 to {2 * dim - 1})"
-        raise FitError(f"angles: expected none, {wanted}, got {coordinates.angles}")
+        raise FitError(
+            f"angles: expected none, all q of the sites (0 to {dim - 1}), or all q and p (0 to "
+            f"{2 * dim - 1}), got {coordinates.angles}"
+        )
     if coordinates.angles and fields > 1:
         raise FitError(f"expected no angles where a site has {fields} q: a single q may be one")
     return Sites(kind, sides[coordinates.angles], fields)

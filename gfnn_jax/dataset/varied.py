@@ -35,11 +35,15 @@ def check_varied(pairs: Pairs) -> None:
     if (TIME in args) != (pairs.period is not None):
         came = "t0 without a period" if TIME in args else "a period without t0"
         raise FitError(f"expected t0, the time of a drive, together with its period; got {came}")
-    given = np.asarray(0.0 if pairs.period is None else pairs.period)
-    known = given.ndim == 0 and given.dtype.kind in "fiu" and 0 < float(given) < np.inf
-    if pairs.period is not None and not known:
-        wanted = "expected a number that is finite and above 0 as the drive's period"
-        raise FitError(f"{wanted}, got {pairs.period!r}")
+    if pairs.period is not None and not (
+        np.ndim(pairs.period) == 0
+        and np.asarray(pairs.period).dtype.kind in "fiu"
+        and 0 < float(pairs.period) < np.inf
+    ):
+        raise FitError(
+            "expected a number that is finite and above 0 as the drive's period, got "
+            f"{pairs.period!r}"
+        )
     try:
         check_names(pairs.dim, tuple(name for name in args if name != TIME))
     except InputError as error:
@@ -52,8 +56,10 @@ def check_varied(pairs: Pairs) -> None:
         if bad.any():
             what = "finite time steps above 0" if name == "dt" else f"finite values of {name}"
             row = int(np.argmax(bad))
-            got = f"{int(bad.sum())} of {len(bad)} that are not, the first is {values[row]}"
-            raise FitError(f"expected {what}, got {got} in row {row}")
+            raise FitError(
+                f"expected {what}, got {int(bad.sum())} of {len(bad)} that are not, the first is "
+                f"{values[row]} in row {row}"
+            )
 
 
 def as_varied(
@@ -73,8 +79,10 @@ def as_varied(
         usual = np.median(pairs.dt)
         rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _Options.printed * usual)
         if len(rows) >= _Options.nearly_all * len(pairs):
-            told = f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart"
-            messages.append(f"{told}: they are left out (--learn hamiltonian uses them)")
+            messages.append(
+                f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart: "
+                "they are left out (--learn hamiltonian uses them)"
+            )
             pairs = pairs.take(rows)
             pairs = dataclasses.replace(pairs, dt=float(np.mean(pairs.dt)))
     differs = "dt" if np.ndim(pairs.dt) else "parameters" if pairs.args else None
@@ -119,8 +127,11 @@ def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
             own_time = [_one_phase(args.pop(TIME)[0], one, period)]
             period = None
     kept = {name: v for name, v in args.items() if name not in still}
-    out = "in all pairs: it is left out, for its effect is not known"
-    messages = [f"the parameter {name} is {args[name][0]:g} {out}" for name in still]
+    messages = [
+        f"the parameter {name} is {args[name][0]:g} in all pairs: it is left out, for its effect "
+        "is not known"
+        for name in still
+    ]
     varied = dataclasses.replace(pairs, dt=one, args=kept or None, t0=None, period=period)
     return varied, own_time + messages
 
@@ -129,10 +140,13 @@ def _one_phase(t0: float, dt: float, period: float) -> str:
     message = f"all pairs begin at the phase t = {t0:g} of the drive: the map from there is learned"
     turns = dt / period
     if abs(turns - round(turns)) <= _Options.same * max(turns, 1.0) and round(turns) > 0:
-        periods = f"{round(turns)} whole period{'s' * (round(turns) > 1)}"
-        return f"{message}, that of {periods} of the drive"
-    told = f"A second step begins at another phase, for dt = {dt:g} is no whole number of periods"
-    return f"{message}. {told}: do not iterate this map. Sample pairs at several phases (t0)"
+        return (
+            f"{message}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
+        )
+    return (
+        f"{message}. A second step begins at another phase, for dt = {dt:g} is no whole number of "
+        "periods: do not iterate this map. Sample pairs at several phases (t0)"
+    )
 
 
 def given_by(data: Dataset) -> np.ndarray | None:

@@ -130,8 +130,10 @@ class LearnedDamping:
         if self.uniform:
             return f"every step multiplies areas by {factors[0]}{by}, one factor for all states"
         planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(factors, 1)]
-        whole = f"every step multiplies areas by {', '.join(planes)}{by}"
-        return f"{whole}: no multiple of the symplectic form is kept"
+        return (
+            f"every step multiplies areas by {', '.join(planes)}{by}: no multiple of the "
+            "symplectic form is kept"
+        )
 
     def line(self, dt: float) -> str:
         """Line about what was learned, with the rate γ of p' = −γ p where one factor b = e^(−γ dt)
@@ -295,11 +297,17 @@ class _Problem:
         if factor.shape[1] == 1:
             factor, std, b = factor[:, 0], std[:, 0], b[:, 0]
         if len(factor) == 1:
-            first, error, shift = (np.asarray(x[0]) for x in (factor, std, found.shift))
-            return LearnedDamping(first, error, shift)
-        extremes = np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))
-        by = found.functions, self.data.parameters, extremes
-        return LearnedDamping(factor, std, found.shift, *by)
+            return LearnedDamping(
+                np.asarray(factor[0]), np.asarray(std[0]), np.asarray(found.shift[0])
+            )
+        return LearnedDamping(
+            factor,
+            std,
+            found.shift,
+            found.functions,
+            self.data.parameters,
+            (np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))),
+        )
 
     def _families(self, spread, factor) -> Iterator[Products]:
         """Families by rising degree, those that the training rows determine in reasonable time."""
@@ -467,11 +475,13 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         jacobians, plain = undone, plain.without(None, damping.piece)
         data = plain
     elif not look_symplectic(jacobians, error, plain.scale):
-        told = f"‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local Jacobians, coordinates in units"
-        told += " of their spread) where a symplectic map has 0. Check the order q1…qd, p1…pd, and"
-        told += " look for friction or a drive. If p are velocities, learn the law of a recording"
-        told += f" (--positions, --velocities; gfnn.Recording).{differing(jacobians)}"
-        messages.append(f"{NOT_SYMPLECTIC}: {told}")
+        messages.append(
+            f"{NOT_SYMPLECTIC}: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
+            "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
+            "the order q1…qd, p1…pd, and look for friction or a drive. If p are velocities, learn "
+            "the law of a recording (--positions, --velocities; gfnn.Recording)."
+            + differing(jacobians)
+        )
     charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:
         data = data.without(charts.half, charts.half)
@@ -485,5 +495,7 @@ def _thin(data: Dataset) -> list[str]:
     if dimension > min(data.dim, len(entering) - 1):
         return []
     where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
-    told = f"the pairs lie on {where} of the {len(entering)}-dimensional phase space, as those of"
-    return [f"{told} one orbit do. The map is learned there only: other initial states widen it"]
+    return [
+        f"the pairs lie on {where} of the {len(entering)}-dimensional phase space, as those of one "
+        "orbit do. The map is learned there only: other initial states widen it"
+    ]

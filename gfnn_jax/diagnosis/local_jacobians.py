@@ -62,9 +62,10 @@ def check_number(pairs: Pairs) -> None:
     """Raises FitError where there are fewer pairs than a local Jacobian needs."""
     if len(pairs) < 8 * pairs.dim:
         turned = 8 * len(pairs) < 2 * pairs.dim
-        wanted = f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}"
-        advice = ": a row is a state; are the arrays transposed?" * turned
-        raise FitError(f"{wanted}, got {len(pairs)}{advice}")
+        raise FitError(
+            f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
+            f"got {len(pairs)}" + turned * ": a row is a state; are the arrays transposed?"
+        )
 
 
 class ChartDeterminant(NamedTuple):
@@ -274,13 +275,17 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         message = _about(name, determinants[name], folded, ())
         return Charts([CHARTS[beyond[0]]], None, determinants, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in determinants.items())
-    told = f"each has a determinant near 0 ({lows}), and no generating function exists there. Take"
-    told += " pairs of a smaller dt or region, or learn H without a chart: --learn hamiltonian"
-    raise FitError(f"no chart covers these data, with or without a base map: {told}")
+    raise FitError(
+        "no chart covers these data, with or without a base map: each has a determinant near 0 "
+        f"({lows}), and no generating function exists there. Take pairs of a smaller dt or region, "
+        "or learn H without a chart: --learn hamiltonian"
+    )
 
 
 def _about(name, determinant: ChartDeterminant, what, valid) -> str:
     instead = [n for n in ("midpoint", "type2", "type3") if n in valid and n != name]
     advice = f". Use --chart {instead[0]}" if instead else ". Take a smaller dt"
-    told = f"its determinant, of ∂w/∂z, falls to {determinant.low:.2g} and is negative for"
-    return f"chart {name} {what}: {told} {100 * determinant.negative:.0f} % of the states{advice}"
+    return (
+        f"chart {name} {what}: its determinant, of ∂w/∂z, falls to {determinant.low:.2g} and is "
+        f"negative for {100 * determinant.negative:.0f} % of the states{advice}"
+    )

@@ -130,13 +130,20 @@ def clean(
     elif len(kept) < count:
         data = data.take(kept)
     if len(found_outliers):
-        told = f"{len(found_outliers)} of {count} pairs contradict the pairs around them"
-        many = "too many for outliers, they are kept. Is q first, and does z1 follow z0?"
-        what = "outliers, they are left out" if few else many
-        messages.append(f"{told} (numbers {named(row[found_outliers])}, from 0): {what}")
+        messages.append(
+            f"{len(found_outliers)} of {count} pairs contradict the pairs around them "
+            f"(numbers {named(row[found_outliers])}, from 0): "
+            + (
+                "outliers, they are left out"
+                if few
+                else "too many for outliers, they are kept. Is q first, and does z1 follow z0?"
+            )
+        )
     if len(gross):
-        told = f"{len(gross)} of {count} pairs (numbers {named(row[gross])}, from 0) are far from a"
-        messages.append(f"{told} polynomial fitted to the others: outliers, they are left out")
+        messages.append(
+            f"{len(gross)} of {count} pairs (numbers {named(row[gross])}, from 0) are far from a "
+            "polynomial fitted to the others: outliers, they are left out"
+        )
     return data, messages
 
 

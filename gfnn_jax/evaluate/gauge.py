@@ -65,6 +65,10 @@ def beside_flow(map_: SymplecticMap, pairs: Pairs, degree: int = 6) -> BesideFlo
     def relative(x: np.ndarray) -> float:
         return float(np.sqrt(np.mean(x**2)))
 
-    parts = (of_state[..., 1:] @ found[1:] / unit, (momenta - of_state @ found) / unit)
-    parts = (*parts, moved / spread, turned / unit)
-    return BesideFlow(float(found[0]), *map(relative, parts))
+    return BesideFlow(
+        float(found[0]),
+        relative(of_state[..., 1:] @ found[1:] / unit),
+        relative((momenta - of_state @ found) / unit),
+        relative(moved / spread),
+        relative(turned / unit),
+    )

@@ -202,8 +202,9 @@ def _slope(x, lanes, steps, transform):
     error = float(np.sqrt(variance))
     half = float(stdtrit(degrees, 0.975)) * error
     value = float(value)
-    interval, ends = (value - half, value + half), (float(steps[0]), float(steps[-1]))
-    return Estimate(value, error, interval, *ends, num_lanes)
+    return Estimate(
+        value, error, (value - half, value + half), float(steps[0]), float(steps[-1]), num_lanes
+    )
 
 
 def semi_major_axis(z):

@@ -84,9 +84,13 @@ def _rendered(title: str, verdict: str, sections: Sequence[Section]) -> str:
     kind, _, reason = verdict.partition(": ")
     template = files("gfnn_jax.evaluate").joinpath("page.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    shown = [section for section in sections if not section.empty]
-    words = {"title": title, "verdict": kind, "reason": reason, "meaning": _MEANING.get(kind, "")}
-    return environment.from_string(template).render(sections=shown, **words)
+    return environment.from_string(template).render(
+        title=title,
+        verdict=kind,
+        reason=reason,
+        meaning=_MEANING.get(kind, ""),
+        sections=[section for section in sections if not section.empty],
+    )
 
 
 def figure(fit: Fit) -> Figure | None:
@@ -147,11 +151,16 @@ def write_refusal(recording: Recording, error: Exception, folder: Path, about: A
     result["data"] = {**refused["data"], "source": recording.source}
     summary = recording.summary()
     drawn = _svg(of_recordings.recording_figure(recording, summary), "The recording.")
-    notes = [*about.notes, *recording.notes, *map(str, summary.faults)]
-    sections = [Section("Why", lines=[str(error)])]
-    sections.append(Section("The data", lines=notes, figures=[drawn]))
-    sections.append(Section("To do next", lines=[summary.command]))
-    sections.append(_made(float("nan"), about.command))
+    sections = [
+        Section("Why", lines=[str(error)]),
+        Section(
+            "The data",
+            lines=[*about.notes, *recording.notes, *map(str, summary.faults)],
+            figures=[drawn],
+        ),
+        Section("To do next", lines=[summary.command]),
+        _made(float("nan"), about.command),
+    ]
     atomic_write(folder / PAGE, _rendered(_title(recording), verdict, sections))
     atomic_write(folder / REPORT, to_json(result))
 
@@ -186,10 +195,17 @@ def _of_law(
         begin = of_recordings.begin_of(own, fit.learned_to)
         yield Section("Simulation", script=simulation(law, own, begin))
     if law.traces and fit.data is not None:
-        lines = [f"{name}: residuals {one.text}." for name, one in law.whiteness.items()]
-        told = "Measured minus law along the arcs of the fit: against time, the channel, and its"
-        drawn = _svg(of_recordings.residuals_figure(law, fit.data), f"{told} rate of change.")
-        yield Section("Residuals", lines=lines, figures=[drawn])
+        yield Section(
+            "Residuals",
+            lines=[f"{name}: residuals {one.text}." for name, one in law.whiteness.items()],
+            figures=[
+                _svg(
+                    of_recordings.residuals_figure(law, fit.data),
+                    "Measured minus law along the arcs of "
+                    "the fit: against time, the channel, and its rate of change.",
+                )
+            ],
+        )
     yield Section("Not identified", lines=list(_not_identified(law)))
     heads = ("alternative", "odds of this law against it", "")
     yield Section("Rivals", heads=heads, rows=list(_rivals(law)))
@@ -217,9 +233,13 @@ def _coming(fit: Fit, law: LearnedLaw) -> list[tuple[str, str]]:
     """Figure of the forecast from the end of what was learned from."""
     if fit.data is None:
         return []
-    told = "Forecast from one state at the dashed line on, and what was measured."
-    drawn = of_recordings.coming_figure(law, fit.data, fit.learned_to)
-    return [_svg(drawn, f"{told} Two standard deviations are shaded.")]
+    return [
+        _svg(
+            of_recordings.coming_figure(law, fit.data, fit.learned_to),
+            "Forecast from one state at the "
+            "dashed line on, and what was measured. Two standard deviations are shaded.",
+        )
+    ]
 
 
 def _forecasts(
@@ -245,8 +265,10 @@ def _forecasts(
 def _not_identified(law: LearnedLaw) -> Iterator[str]:
     yield from (f"The record does not distinguish: {in_letters(pair)}." for pair in law.alike)
     for term, limit in law.which_friction.limits.items():
-        seen = f"No friction of the form {in_letters(term)} is seen: its coefficient"
-        yield f"{seen} in R is below {limit:.2g} (2 σ)."
+        yield (
+            f"No friction of the form {in_letters(term)} is seen: its coefficient in R is below "
+            f"{limit:.2g} (2 σ)."
+        )
     if law.delay is not None and not np.isfinite(law.delay[1]):
         yield "The delay of the inputs is not determined."
 
@@ -283,15 +305,24 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     if law is not None and law.formula:
         with_formula = "Lagrangian" not in law.formula
         shown = as_mathml(law.formula) if with_formula else f"<mtext>{escape(law.formula)}</mtext>"
-        formulas = [("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")]
-        rows = [(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms]
-        table = {"heads": ("term", "coefficient"), "rows": rows}
-        yield Section("Law", formulas=formulas, lines=[*fit.bracket_lines, *law.notes], **table)
-    lines = [f"{found.line}.", f"Time step {float(np.asarray(fit.map.dt)):g}."]
-    lines += [f"The search ended: {found.ended}.", *filter(None, [found.stated_by])]
-    lines += [] if found.positions is None else [str(found.positions)]
-    lines += [] if found.met else map(str, found.partial_laws)
-    yield Section("The map", lines=lines)
+        yield Section(
+            "Law",
+            formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
+            lines=[*fit.bracket_lines, *law.notes],
+            heads=("term", "coefficient"),
+            rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
+        )
+    yield Section(
+        "The map",
+        lines=[
+            f"{found.line}.",
+            f"Time step {float(np.asarray(fit.map.dt)):g}.",
+            f"The search ended: {found.ended}.",
+            *([found.stated_by] if found.stated_by else []),
+            *([str(found.positions)] if found.positions is not None else []),
+            *map(str, found.partial_laws if not found.met else ()),
+        ],
+    )
     heads, rows = candidate_cells(found)
     yield Section("Candidates", heads=heads, rows=rows)
     null = law.null_terms if law is not None else ()

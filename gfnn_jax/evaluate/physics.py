@@ -148,10 +148,12 @@ class _System(NamedTuple):
         """The system with its coefficients moved by these (k,)."""
         ends = np.cumsum([self.law.terms.count, self.law.friction.count, self.law.gains.size])
         of_terms, of_losses, _, of_rate = np.split(by, ends)
-        coefficients = self.law.coefficients + of_terms
-        losses, more = np.asarray(self.law.losses) + of_losses, of_rate[0] if len(of_rate) else 0.0
-        own = {"losses": losses, "uniform": self.law.uniform + more}
-        law = dataclasses.replace(self.law, coefficients=coefficients, **own)
+        law = dataclasses.replace(
+            self.law,
+            coefficients=self.law.coefficients + of_terms,
+            losses=np.asarray(self.law.losses) + of_losses,
+            uniform=self.law.uniform + (of_rate[0] if len(of_rate) else 0.0),
+        )
         return self._replace(law=law)
 
     def with_errors(
@@ -372,16 +374,24 @@ def _mode(
     if imag[0] <= 1e-9 * size:
         return [Quantity(f"{name}: rate of decay", -real[0], real[1], "1/s", "overdamped")]
     of_shape = f"amplitudes {shape}" if shape else ""
-    hertz = imag[0] / (2 * np.pi), imag[1] / (2 * np.pi)
-    found = [Quantity(f"{name}: frequency", *hertz, "Hz", of_shape)]
+    found = [
+        Quantity(f"{name}: frequency", imag[0] / (2 * np.pi), imag[1] / (2 * np.pi), "Hz", of_shape)
+    ]
     if abs(real[0]) <= 1e-9 * size:
         return found
     ratio, of_ratio = -real[0] / size, real[1] / size
-    viscous = (f"{name}: damping ratio ζ", ratio, of_ratio, "", "by viscous friction")
-    quality = (f"{name}: quality factor Q", 1 / (2 * ratio), of_ratio / (2 * ratio**2), "")
-    time = -1 / real[0], real[1] / real[0] ** 2
-    decay = (f"{name}: time of decay to 1/e", *time, "s", "of the amplitude")
-    return [*found, Quantity(*viscous), Quantity(*quality), Quantity(*decay)]
+    return [
+        *found,
+        Quantity(f"{name}: damping ratio ζ", ratio, of_ratio, "", "by viscous friction"),
+        Quantity(f"{name}: quality factor Q", 1 / (2 * ratio), of_ratio / (2 * ratio**2), ""),
+        Quantity(
+            f"{name}: time of decay to 1/e",
+            -1 / real[0],
+            real[1] / real[0] ** 2,
+            "s",
+            "of the amplitude",
+        ),
+    ]
 
 
 def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
@@ -390,8 +400,15 @@ def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
     at = f"swings of ± {a:.3g} {unit}".rstrip()
     drift = swings.frequency[-1] / swings.frequency[0] - 1
     against = f"{100 * drift:+.2g} % against small swings" if abs(drift) > 1e-6 else "as small ones"
-    largest = float(swings.frequency[-1]), float(swings.frequency_std[-1])
-    found = [Quantity(f"{at}, without friction: frequency", *largest, "Hz", against)]
+    found = [
+        Quantity(
+            f"{at}, without friction: frequency",
+            float(swings.frequency[-1]),
+            float(swings.frequency_std[-1]),
+            "Hz",
+            against,
+        )
+    ]
     if np.isfinite(swings.quality[-1]):
         about = "2π × energy ÷ energy lost in a period, by all friction"
         if system.law.friction.count > system._viscous().friction.count:

@@ -24,7 +24,6 @@ _ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside
 _OF_LAW = ("terms", "friction", "constants", "symmetries", "rivals", "notes", "dropped")
 _OF_FRICTION = ("kinds", "odds", "limits")
 _OF_PAIRS = ("validation_rms", "validation_relative", "tolerance", "tolerance_met")
-_OF_MAP = ("symplecticity_defect", "chart_determinant_min", "newton_iterations_max")
 _COSTS = ("operations", "microseconds_per_step", "fit_seconds", "rank", "condition", "chosen")
 
 
@@ -47,9 +46,15 @@ def _of(result: Any, *names: str) -> dict[str, Any]:
 
 
 def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
-    found = {"verdict": fit.verdict, "scene": scene, "dt": float(np.asarray(fit.map.dt))}
-    found |= {"seed": seed, "dtype": str(fit.map.scale.dtype)}
-    return found | {"device": device(), "versions": versions()}
+    return {
+        "verdict": fit.verdict,
+        "scene": scene,
+        "dt": float(np.asarray(fit.map.dt)),
+        "seed": seed,
+        "dtype": str(fit.map.scale.dtype),
+        "device": device(),
+        "versions": versions(),
+    }
 
 
 def assemble(
@@ -60,27 +65,40 @@ def assemble(
     data: facts about the pairs beside their number: source, digest, precision, units.
     """
     chosen = fit.chosen
-    pairs = {"num_pairs": fit.num_pairs, "symplecticity_defect": fit.data_defect}
-    took: dict[str, Any] = {"seconds": chosen.fit_seconds, "total_seconds": fit.seconds}
-    took |= {"tolerance_is_relative": fit.asked.relative, "tolerance_met": fit.met}
-    took |= _of(chosen, "train_rms", *_ERRORS[:3], "deviations")
-    took |= _of(fit, "compile_seconds", "stated_by", "tolerance", "ended")
-    took |= _of(fit, "operations", "max_operations", "messages")
-    defect = fit.symplecticity_defect if fit.defect_known else None
-    of_map = {"multiplier": fit.map.multiplier(), "damping": _damping(fit)}
-    of_map |= {"positions": fit.positions, "symplecticity_defect": defect}
-    of_map |= {"chart_determinant_min": fit.model_determinant_min}
-    of_map |= {"chart_determinants_of_data": {n: j.low for n, j in fit.determinants.items()}}
-    of_map |= _of(chosen, "newton_iterations_max")
     return {
         **_made(fit, None if fit.scene is None else fit.scene.name, fit.seed),
-        "data": {**pairs, **_of(fit, "noise", "symmetries"), **(data or {})},
-        "model": {**_of(chosen, *_LABELS), "base_map": fit.base_map},
-        "fit": took,
+        "data": {
+            "num_pairs": fit.num_pairs,
+            "symplecticity_defect": fit.data_defect,
+            "noise": fit.noise,
+            "symmetries": fit.symmetries,
+            **(data or {}),
+        },
+        "model": {
+            **_of(chosen, *_LABELS),
+            "base_map": fit.base_map,
+        },
+        "fit": {
+            "seconds": chosen.fit_seconds,
+            "total_seconds": fit.seconds,
+            "tolerance_is_relative": fit.asked.relative,
+            "tolerance_met": fit.met,
+            **_of(chosen, "train_rms", *_ERRORS[:3], "deviations"),
+            **_of(fit, "compile_seconds", "stated_by", "tolerance", "ended"),
+            **_of(fit, "operations", "max_operations", "messages"),
+        },
         "hamiltonian": _hamiltonian(fit),
         "bracket": _bracket(fit),
         "partial_laws": fit.partial_laws,
-        "map": of_map,
+        "map": {
+            "multiplier": fit.map.multiplier(),
+            "damping": _damping(fit),
+            "positions": fit.positions,
+            "symplecticity_defect": fit.symplecticity_defect if fit.defect_known else None,
+            "chart_determinant_min": fit.model_determinant_min,
+            "chart_determinants_of_data": {n: j.low for n, j in fit.determinants.items()},
+            "newton_iterations_max": chosen.newton_iterations_max,
+        },
         "rollout": rollout,
         "candidates": [_of(c, *_LABELS, *_ERRORS, *_COSTS) for c in fit.candidates],
     }
@@ -105,10 +123,14 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     """Learned H as formula and terms, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
         return None
-    law, which = fit.hamiltonian, fit.hamiltonian.which_friction
-    told = which and {**_of(which, *_OF_FRICTION), "text": str(which)}
-    found = {"formula": fit.formula, "which_friction": told, "search_cut_short": law.ended or None}
-    return found | _of(law, *_OF_LAW)
+    law = fit.hamiltonian
+    which = law.which_friction
+    return {
+        "formula": fit.formula,
+        "which_friction": which and {**_of(which, *_OF_FRICTION), "text": str(which)},
+        "search_cut_short": law.ended or None,
+        **_of(law, *_OF_LAW),
+    }
 
 
 def _bracket(fit: Fit) -> dict[str, Any] | None:
@@ -129,26 +151,38 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
     box = map_.parameters
     ends = () if box is None else np.array([box.names, box.low, box.high], object).T.tolist()
     num_parameters = sum(t.std > 0 for t in (*fit.lagrangian.terms, *fit.friction.terms))
-    label = f"L of {len(fit.lagrangian.terms)} terms"
-    model = ("lagrangian", "Lagrangian", label, None, num_parameters)
-    took: dict[str, Any] = {"seconds": fit.seconds, "compile_seconds": 0.0}
-    took |= {"total_seconds": fit.seconds, "train_rms": fit.residual, **dict.fromkeys(_OF_PAIRS)}
-    took |= _of(fit, "ended", "messages", "steps", "alike", "next_motions")
-    inputs: dict[str, Any] = {"hold": sensors.hold, "other_rules": fit.input_rules}
-    delay_std = None if fit.delay is None or np.isnan(fit.delay[1]) else fit.delay[1]
-    inputs |= {"delay": sensors.delay, "delay_std": delay_std, "gains": {}}
-    for name, forces in fit.gains.items():
-        inputs["gains"][name] = {q: {"gain": g, "std": s} for q, (g, s) in forces.items()}
     return {
         **_made(fit, None, seed),
         "data": {"num_pairs": None, "num_samples": fit.num_samples, "source": source},
-        "model": dict(zip(_LABELS, model, strict=True)),
-        "fit": took,
+        "model": {
+            "learns": "lagrangian",
+            "family": "Lagrangian",
+            "label": f"L of {len(fit.lagrangian.terms)} terms",
+            "chart": None,
+            "num_parameters": num_parameters,
+        },
+        "fit": {
+            "seconds": fit.seconds,
+            "compile_seconds": 0.0,
+            "total_seconds": fit.seconds,
+            "train_rms": fit.residual,
+            **dict.fromkeys(_OF_PAIRS),
+            **_of(fit, "ended", "messages", "steps", "alike", "next_motions"),
+        },
         "hamiltonian": None if fit.hamiltonian is None else _law(fit.hamiltonian),
         "lagrangian": _law(fit.lagrangian),
         "friction": {**_law(fit.friction), **_of(fit.which_friction, *_OF_FRICTION)},
         "rivals": fit.rivals,
-        "inputs": inputs,
+        "inputs": {
+            "hold": sensors.hold,
+            "other_rules": fit.input_rules,
+            "delay": sensors.delay,
+            "delay_std": None if fit.delay is None or np.isnan(fit.delay[1]) else fit.delay[1],
+            "gains": {
+                name: {q: {"gain": g, "std": s} for q, (g, s) in forces.items()}
+                for name, forces in fit.gains.items()
+            },
+        },
         "parameters": {name: {"low": low, "high": high} for name, low, high in ends},
         "zeros": {name: {"zero": z, "std": s} for name, (z, s) in fit.zeros.items()},
         "observe": fit.observe,
@@ -157,7 +191,12 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
         "friction_level": sensors.level,
         "wander": sensors.wander,
         **_of(fit, "units", "velocities", "whiteness", "gauge", "energy", "horizon"),
-        "map": {"multiplier": map_.multiplier(), **dict.fromkeys(_OF_MAP)},
+        "map": {
+            "multiplier": map_.multiplier(),
+            "symplecticity_defect": None,
+            "chart_determinant_min": None,
+            "newton_iterations_max": None,
+        },
         "rollout": None,
         "candidates": [],
     }
@@ -175,16 +214,22 @@ def rollout_part(*, seconds: float, status, statistics, growth, drift) -> dict[s
     """
     num_trajectories, num_steps = len(status), len(statistics.mean) - 1
     reported = [n for n in STEPS_REPORTED if n <= num_steps]
-    none, each = {str(n): None for n in STEPS_REPORTED}, num_steps * num_trajectories
-    found = {"num_trajectories": num_trajectories, **_of(statistics, "num_excluded", "num_lost")}
-    found |= {"num_steps": num_steps, "seconds": seconds}
-    found |= {"microseconds_per_step": 1e6 * seconds / each, "status_counts": status_counts(status)}
-    for key, values in (("error", statistics.mean), ("error_median", statistics.median)):
-        found[key] = none | {str(n): float(values[n]) for n in reported}
-    for key, estimate in (("growth_exponent", growth), ("energy_drift", drift)):
-        found[key] = estimate.value if estimate else None
-        found[f"{key}_interval"] = list(estimate.interval) if estimate else None
-    return found
+    none = {str(n): None for n in STEPS_REPORTED}
+    return {
+        "num_trajectories": num_trajectories,
+        "num_excluded": statistics.num_excluded,
+        "num_lost": statistics.num_lost,
+        "num_steps": num_steps,
+        "seconds": seconds,
+        "microseconds_per_step": 1e6 * seconds / (num_steps * num_trajectories),
+        "status_counts": status_counts(status),
+        "error": none | {str(n): float(statistics.mean[n]) for n in reported},
+        "error_median": none | {str(n): float(statistics.median[n]) for n in reported},
+        "growth_exponent": growth.value if growth else None,
+        "growth_exponent_interval": list(growth.interval) if growth else None,
+        "energy_drift": drift.value if drift else None,
+        "energy_drift_interval": list(drift.interval) if drift else None,
+    }
 
 
 def status_counts(status) -> dict[str, int]:

@@ -61,11 +61,15 @@ def simulation(law: LearnedLaw, recording: Recording, begin: float) -> str | Non
     d, args = law.map.dim, [float(recording.values(name, run)[0]) for name in names]
     v = velocities_of(law.map, z, np.array([args]) if args else None)
     known = len(sensors.positions)
-    channels = [_channel(recording, run, i, rows, z[0, i]) for i in range(known)]
-    shown = {"t": t[rows].tolist(), "channels": channels, "start": [*z[0, :d], *v[0]]}
-    shown |= {"parameters": args, "inputs": _inputs(law, recording, run, t[rows], args)}
-    shown["coefficients"] = np.asarray(law.map.pieces[0].params).tolist()
-    shown["sliders"] = [slider._asdict() for slider in _sliders(law)]
+    shown = {
+        "t": t[rows].tolist(),
+        "channels": [_channel(recording, run, i, rows, z[0, i]) for i in range(known)],
+        "start": [*z[0, :d], *v[0]],
+        "parameters": args,
+        "inputs": _inputs(law, recording, run, t[rows], args),
+        "coefficients": np.asarray(law.map.pieces[0].params).tolist(),
+        "sliders": [slider._asdict() for slider in _sliders(law)],
+    }
     text = json.dumps(shown, ensure_ascii=False).replace("</", "<\\/")
     drawn = files("gfnn_jax.evaluate").joinpath("page.js").read_text(encoding="utf-8")
     return f"{source}\nconst shown = {text};\n{drawn}"
@@ -81,10 +85,14 @@ def _channel(recording: Recording, run: str, place: int, rows: Any, start: float
     turn = 0.0
     if name in recording.angles and len(known):
         turn = 2 * np.pi / factor * np.round((known[0] - start / factor) * factor / (2 * np.pi))
-    label, plain = f"{name} [{unit}]" if unit else name, re.sub(r"\W", "_", name)
-    values = [float(value) if np.isfinite(value) else None for value in y]
-    told = {"name": plain, "label": label, "place": place, "factor": factor}
-    return {**told, "turn": float(turn), "y": values}
+    return {
+        "name": re.sub(r"\W", "_", name),
+        "label": f"{name} [{unit}]" if unit else name,
+        "place": place,
+        "factor": factor,
+        "turn": float(turn),
+        "y": [float(value) if np.isfinite(value) else None for value in y],
+    }
 
 
 def _inputs(

@@ -55,9 +55,10 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     InputError, in one line, for a map that cannot be written in C.
     """
     if (reason := why_not(map_)) is not None:
-        told = f"this map cannot be written in C: {reason}"
-        takes = "C takes polynomials, Fourier harmonics and formulas: use --to stablehlo"
-        raise InputError(f"{told}. {takes}")
+        raise InputError(
+            f"this map cannot be written in C: {reason}. C takes polynomials, Fourier harmonics "
+            "and formulas: use --to stablehlo"
+        )
     inner = dataclasses.replace(map_, coordinates=CARTESIAN)  # what pieces move
     laws = [isinstance(piece, (Flow, LieFlow, DampedFlow)) for piece in map_.pieces]
     alone = [dataclasses.replace(inner, pieces=(piece,)) for piece in map_.pieces]
@@ -132,25 +133,35 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequenc
     changed = map_.coordinates.forward is not CARTESIAN.forward
     centres = np.ravel(np.asarray(map_.angle_centre))
     turns = f", turns[{len(angles)}]" if angles else ""
-    lines = [f"double y[{width + more}]{turns};"]
-    lines.append("to_inner(z, y);" if changed else f"memcpy(y, z, {width}*sizeof *y);")
-    lines += [f"memcpy(y + {width}, args, {more}*sizeof *y);"] if more else []
-    lines += ahead
-    for k, (a, centre) in enumerate(zip(angles, centres, strict=True)):
-        lines.append(f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);")
-    lines.append(f"int inside = all_finite({width}, y);")
+    lines = [
+        f"double y[{width + more}]{turns};",
+        "to_inner(z, y);" if changed else f"memcpy(y, z, {width}*sizeof *y);",
+        *([f"memcpy(y + {width}, args, {more}*sizeof *y);"] if more else []),
+        *ahead,
+        *(
+            f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);"
+            for k, (a, centre) in enumerate(zip(angles, centres, strict=True))
+        ),
+        f"int inside = all_finite({width}, y);",
+    ]
     assert isinstance(domain, Domain)
     if domain.keep:
         limit = literal(float(np.asarray(domain.limit)))
         lines += ["double kappa[1];", "christoffel(y, kappa);"]
         lines.append(f"inside = inside && kappa[0] <= {limit};")
     lines += inside_ranges(map_)
-    lines += ["int status = OK;", *(f"status = worse(status, {piece}(y));" for piece in pieces)]
-    lines += ["if (status == OK && !inside)", "    status = LEFT_DOMAIN;"]
-    lines += [f"if (!all_finite({width}, y))", "    status = NON_FINITE;"]
-    lines += [f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)]
-    lines.append("to_user(y, Z);" if changed else f"memcpy(Z, y, {width}*sizeof *y);")
-    body = "\n".join(f"    {line}" for line in [*lines, "return status;"])
+    lines += [
+        "int status = OK;",
+        *(f"status = worse(status, {piece}(y));" for piece in pieces),
+        "if (status == OK && !inside)",
+        "    status = LEFT_DOMAIN;",
+        f"if (!all_finite({width}, y))",
+        "    status = NON_FINITE;",
+        *(f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)),
+        "to_user(y, Z);" if changed else f"memcpy(Z, y, {width}*sizeof *y);",
+        "return status;",
+    ]
+    body = "\n".join(f"    {line}" for line in lines)
     return f"{_signature(map_, name)}\n{{\n{body}\n}}\n"
 
 
@@ -257,9 +268,10 @@ def inside_ranges(map_: SymplecticMap) -> list[str]:
         turns = f"floor(({time} - {literal(low[-1])})/{period})"
         lines = [f"const double phase = {time} - {turns}*{period};"]
         given[-1] = "phase"
-    within = "inside = inside && {0} >= {1} && {0} <= {2};"
-    ranges = zip(given, low, high, strict=True)
-    return lines + [within.format(v, literal(a), literal(b)) for v, a, b in ranges]
+    return lines + [
+        f"inside = inside && {value} >= {literal(a)} && {value} <= {literal(b)};"
+        for value, a, b in zip(given, low, high, strict=True)
+    ]
 
 
 def about_args(map_: SymplecticMap, name: str) -> str:

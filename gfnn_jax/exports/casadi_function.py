@@ -48,9 +48,12 @@ def casadi_function(map_: SymplecticMap, name: str, about: Mapping[str, Any]) ->
     scale = casadi.DM(np.asarray(graph.scale))
     stages, h = casadi.SX.sym("stages", width, rule.nodes.size), casadi.SX.sym("h")
     inside = casadi.repmat(z, 1, rule.nodes.size) + stages @ casadi.DM(rule.coupling.T)
-    each = enumerate(zip(rule.weights, rule.nodes, strict=True))
-    slopes = (h * w * rates(inside[:, i], u, dp, t + node * h) for i, (w, node) in each)
-    slopes = casadi.horzcat(*slopes)
+    slopes = casadi.horzcat(
+        *(
+            h * weight * rates(inside[:, i], u, dp, t + node * h)
+            for i, (weight, node) in enumerate(zip(rule.weights, rule.nodes, strict=True))
+        )
+    )
     off = casadi.vec((stages - slopes) / casadi.repmat(scale, 1, rule.nodes.size))
     given = casadi.vertcat(z, u, dp, t, h)
     equation = {"x": casadi.vec(stages), "p": given, "g": off}

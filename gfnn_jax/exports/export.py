@@ -39,8 +39,16 @@ def _c_of_law(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
 
 
 Printer = Callable[[SymplecticMap, str, Mapping[str, Any]], str | bytes]
-_PRINTERS: dict[str, Printer] = {"c": c_source, "c-taylor": _c_of_law, "js": javascript}
-_PRINTERS |= {"jax": jax_source, "casadi": casadi_function, "fmu": fmu, "mjcf": mjcf, "urdf": urdf}
+_PRINTERS: dict[str, Printer] = {
+    "c": c_source,
+    "c-taylor": _c_of_law,
+    "js": javascript,
+    "jax": jax_source,
+    "casadi": casadi_function,
+    "fmu": fmu,
+    "mjcf": mjcf,
+    "urdf": urdf,
+}
 _KEYWORDS_OF_C = re.compile(
     r"auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for"
     r"|goto|if|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct"
@@ -100,15 +108,18 @@ def export(
     about = _about(folder)
     of_law = isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
     if to in _PRINTERS and map_.bracket is not None and (to not in ("c", "c-taylor") or not of_law):
-        own = f"this map has a bracket of its own, {map_.bracket.name}"
-        told = f"{own}, of which --to {to} makes no"
-        of_laws = ", --to c-taylor or, for the formula of its law, --to latex" * of_law
-        raise InputError(f"{told} step: use --to stablehlo{of_laws}")
+        raise InputError(
+            f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no "
+            "step: use --to stablehlo"
+            + ", --to c-taylor or, for the formula of its law, --to latex"
+            * of_law
+        )
     if to in _PRINTERS:
         name = out.stem
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or _KEYWORDS_OF_C.fullmatch(name):
-            told = "expected a name of letters, digits and _: functions are named so"
-            raise InputError(f"{out}: {told}")
+            raise InputError(
+                f"{out}: expected a name of letters, digits and _: functions are named so"
+            )
         atomic_write(out, _PRINTERS[to](map_, name, about))
     else:
         known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}

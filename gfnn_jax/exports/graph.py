@@ -143,10 +143,21 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     names = coordinate_names(dim) if bracket is None else bracket.labels
     of_terms = piece.family if bracket is None else getattr(piece.family, "family", piece.family)
     terms = tuple(of_terms.term_names) if plain or bracket is not None else ()
-    law = tape, list(rates), speeds, limits, directions
-    named = names, (*base, *inputs), terms, params if plain else np.zeros(0)
-    dt, scale = float(map_.dt), np.asarray(map_.scale, float)
-    return LawGraph(*law, *named, tuple(series), time, dt, scale)
+    return LawGraph(
+        tape,
+        list(rates),
+        speeds,
+        limits,
+        directions,
+        names,
+        (*base, *inputs),
+        terms,
+        params if plain else np.zeros(0),
+        tuple(series),
+        time,
+        float(map_.dt),
+        np.asarray(map_.scale, float),
+    )
 
 
 def _of_bracket(bracket: Bracket, piece: Any, p, z, args) -> list[Any]:
@@ -178,8 +189,10 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     law = law_of(family, p)
     own, dim = law.friction, law.dim
     if np.any(own.loaded):
-        told = "this law has friction by the size of an input, which has no series where that is 0"
-        raise InputError(f"{told}, and is in no format yet: forecast it here (gfnn predict)")
+        raise InputError(
+            "this law has friction by the size of an input, which has no series where that is 0, "
+            "and is in no format yet: forecast it here (gfnn predict)"
+        )
     sharp = own.dry & (own.widths <= creep)
     kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED, STRIBECK))
     kinked |= (own.kinds == POWER) & (own.widths % 2 != 1)  # odd powers are smooth

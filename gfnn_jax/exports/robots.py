@@ -97,8 +97,10 @@ def robot_of(map_: SymplecticMap) -> Robot:
     if law.powers is not None:
         raise InputError("MJCF and URDF hold no law of systems that differ in parameters: --to fmu")
     if law.terms.leaders or law.terms.driven:
-        told = "in this law some coordinates move others that do not act back on them, or terms"
-        raise InputError(f"{told} have inputs, which no chain of links does: use --to fmu")
+        raise InputError(
+            "in this law some coordinates move others that do not act back on them, or terms have "
+            "inputs, which no chain of links does: use --to fmu"
+        )
     rng = np.random.default_rng(0)
     q, none = rng.uniform(-np.pi, np.pi, (Options.states, dim)), np.zeros((Options.states, dim))
     at_rest = law.derivatives(q, none)
@@ -106,8 +108,9 @@ def robot_of(map_: SymplecticMap) -> Robot:
     best = min(found, key=lambda chain: chain.off)
     gyroscopic = np.abs(law.momentum(q, none)).max()
     if best.off > Options.most or gyroscopic > 1e-9:
-        told = f"the law differs by {best.off:.0%}"
-        raise InputError(f"no planar chain of links: {told}: use --to fmu or c")
+        raise InputError(
+            f"no planar chain of links: the law differs by {best.off:.0%}: use --to fmu or c"
+        )
     return _of_chain(map_, law, best)
 
 
@@ -248,12 +251,22 @@ def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
         told = (f"{n} = {row}" for n, row in zip(names, rows, strict=True))
         notes.append(f"the columns of the data: {', '.join(told)}")
     down = np.array([0.0, 0.0, -1.0])
-    links, axis = [], np.array([0.0, 1.0, 0.0])
-    for j in range(dim):
-        body = masses[j], centres[j] * down, inertias[j] * np.diag([1.0, 1.0, 1e-3])
-        origin, length = (lengths[j - 1] if j else 0.0) * down, lengths[j] or 2 * centres[j] or 1.0
-        place = Rotation.from_euler("y", -zeros[j]), origin, axis
-        links.append(Link(f"joint{j + 1}", j - 1, False, *body, *place, chain.rotors[j], length))
+    links = [
+        Link(
+            f"joint{j + 1}",
+            j - 1,
+            False,
+            masses[j],
+            centres[j] * down,
+            inertias[j] * np.diag([1.0, 1.0, 1e-3]),
+            Rotation.from_euler("y", -zeros[j]),
+            (lengths[j - 1] if j else 0.0) * down,
+            np.array([0.0, 1.0, 0.0]),
+            chain.rotors[j],
+            lengths[j] or 2 * centres[j] or 1.0,
+        )
+        for j in range(dim)
+    ]
     inputs = dict(zip(named, gains.T, strict=True))
     return Robot(links, damping, dry, inputs, gravity * down, notes, float(map_.dt))
 
@@ -268,10 +281,20 @@ def _of_arm(map_: SymplecticMap, law: BodiesLaw) -> Robot:
         m, centre = J[3, 3], J[:3, 3] / J[3, 3]
         second = J[:3, :3] - m * np.outer(centre, centre)
         about = np.trace(second) * np.eye(3) - second
-        joint = name, bodies.parents[i], bodies.sliding[i]
-        turned = Rotation.from_matrix(np.asarray(bodies.rotations[i]))
-        frame = turned, np.asarray(bodies.origins[i]), np.asarray(bodies.axes[i])
-        links.append(Link(*joint, float(m), centre, about, *frame, float(law.rotors[i])))
+        links.append(
+            Link(
+                name,
+                bodies.parents[i],
+                bodies.sliding[i],
+                float(m),
+                centre,
+                about,
+                Rotation.from_matrix(np.asarray(bodies.rotations[i])),
+                np.asarray(bodies.origins[i]),
+                np.asarray(bodies.axes[i]),
+                float(law.rotors[i]),
+            )
+        )
     damping, dry, left_out = _of_rows(law.friction, law.losses, np.eye(len(links)))
     offsets = ", ".join(f"{n} {c:.6g}" for n, c in zip(bodies.names, law.offsets, strict=True))
     notes = [f"constant forces that the joints hold against, left out: {offsets}", *left_out]
@@ -350,16 +373,20 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     # arm of benchmarks/machines.py is 5 mrad off after 0.5 s by that, and 1 mrad by this. Of its
     # implicit steps, of first order, the free pendulum there is 9 mrad off, by these 0.03.
     stiff = f'solreffriction="{_text(2 * step)} 1" solimpfriction="0.999 0.999 0.001"'
-    parts = [f"<mujoco model={quoteattr(name)}>", _comment(robot, about)]
-    compiler = 'angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"'
-    parts.append(f"<compiler {compiler}/>")
-    parts.append(f"<default><joint {stiff}/><tendon {stiff}/></default>")
-    gravity = f'gravity="{_text(robot.gravity)}"'
-    parts.append(f'<option timestep="{_text(step)}" {gravity} integrator="RK4"/>')
-    bodies = [body(i) for i, link in enumerate(links) if link.parent == BASE]
-    for kind, own in (("worldbody", bodies), ("tendon", tendons), ("actuator", motors)):
-        parts += [f"<{kind}>", *own, f"</{kind}>"] if own else []
-    return "\n".join([*parts, "</mujoco>\n"])
+    parts = [
+        f"<mujoco model={quoteattr(name)}>",
+        _comment(robot, about),
+        '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>',
+        f"<default><joint {stiff}/><tendon {stiff}/></default>",
+        f'<option timestep="{_text(step)}" gravity="{_text(robot.gravity)}" integrator="RK4"/>',
+        "<worldbody>",
+        *(body(i) for i, link in enumerate(links) if link.parent == BASE),
+        "</worldbody>",
+        *(["<tendon>", *tendons, "</tendon>"] if tendons else []),
+        *(["<actuator>", *motors, "</actuator>"] if motors else []),
+        "</mujoco>\n",
+    ]
+    return "\n".join(parts)
 
 
 def urdf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
@@ -369,11 +396,15 @@ def urdf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     and rotors, is told in its comment. Raises InputError where the law is no chain.
     """
     robot = robot_of(map_)
-    others = [row.tolist() for row, _ in (*robot.damping, *robot.dry) if _of_joint(row) is None]
-    left_out = "of the joints' velocities is left out: URDF has none"
-    told = [f"friction along {row} {left_out}" for row in others]
-    forces = robot.inputs.items()
-    told += [f"forces of the joints for a unit of {own}: {row.tolist()}" for own, row in forces]
+    told = [
+        f"friction along {row.tolist()} of the joints' velocities is left out: URDF has none"
+        for row, _ in (*robot.damping, *robot.dry)
+        if _of_joint(row) is None
+    ]
+    told += [
+        f"forces of the joints for a unit of {own}: {row.tolist()}"
+        for own, row in robot.inputs.items()
+    ]
     rotors = ", ".join(f"{link.name} {link.rotor:.6g}" for link in robot.links if link.rotor)
     told += [f"inertias of rotors, left out: {rotors}"] if rotors else []
     parts = ['<?xml version="1.0"?>', f"<robot name={quoteattr(name)}>"]

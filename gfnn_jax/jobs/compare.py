@@ -49,8 +49,10 @@ from gfnn_jax.solve.status import NOT_CONVERGED
 from gfnn_jax.storage import outputs
 
 PAPER_GFNN, OURS = "gfnn-paper", "gfnn"
-TITLES = {name: method.title for name, method in METHODS.items()}
-TITLES |= {PAPER_GFNN: "GFNN (paper)", OURS: "GFNN (ours)"}
+TITLES = {name: method.title for name, method in METHODS.items()} | {
+    PAPER_GFNN: "GFNN (paper)",
+    OURS: "GFNN (ours)",
+}
 _NUM_DEFECTS = 200
 _MODEL = ("learns", "family", "label", "chart", "num_parameters")
 _NO_MAP = {"chart_determinant_min": None, "newton_iterations_max": None}
@@ -87,13 +89,22 @@ def learn_and_roll(
         about = {**_NO_MAP, "symplecticity_defect": defect}
         images, roll = _steps(learned.step, z), partial(step_rollouts, learned.step)
     training = learned.training
-    facts = ("seconds", "compile_seconds", "train_rms", "stopped_because")
-    took = {name: getattr(training, name) for name in facts}  # of the method's own loss
-    took |= {"loss_rms": training.validation_rms, "cap": budget.cap}
-    took |= {"operations": training.operations * training.epochs}
-    took |= {"capped": "cap" in training.stopped_because, "validation_rms": _rms(data, images)}
-    part = {"model": dict(zip(_MODEL, model, strict=True)), "fit": took, "map": about}
-    part["data"] = {"num_pairs": sequences.num_pairs, "sequence_length": length}
+    part = {
+        "model": dict(zip(_MODEL, model, strict=True)),
+        "data": {"num_pairs": sequences.num_pairs, "sequence_length": length},
+        "fit": {  # its errors are those of the method's own loss
+            "seconds": training.seconds,
+            "compile_seconds": training.compile_seconds,
+            "train_rms": training.train_rms,
+            "loss_rms": training.validation_rms,
+            "cap": budget.cap,
+            "operations": training.operations * training.epochs,
+            "capped": "cap" in training.stopped_because,
+            "stopped_because": training.stopped_because,
+            "validation_rms": _rms(data, images),
+        },
+        "map": about,
+    }
     return part, roll(data.z0, NUM_STEPS)
 
 
@@ -120,9 +131,12 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
         fit = search(Pairs(z[:, 0], z[:, 1], scene.dt), scene, asked, progress=progress)
     told = fit.replaced(defect_known=False).report()  # the defect is that of all methods' states
     error = _rms(data, fit.map.step(data.fresh.z0)[0])
-    part = {"model": told["model"], "data": {"num_pairs": fit.num_pairs, "sequence_length": 2}}
-    part["fit"] = {**told["fit"], "validation_rms": error, "cap": None, "capped": False}
-    part["map"] = _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min}
+    part = {
+        "model": told["model"],
+        "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
+        "fit": {**told["fit"], "validation_rms": error, "cap": None, "capped": False},
+        "map": _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min},
+    }
     return part, map_rollouts(fit.map, data.z0, NUM_STEPS)
 
 
@@ -132,10 +146,12 @@ def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
     info = map_.step(z)[1]
     solved = np.asarray(info.status) < NOT_CONVERGED
     defects = np.asarray(map_.defect(z, iterations=info.iterations))[solved]
-    solver: dict[str, Any] = {"newton_iterations_max": int(np.max(np.asarray(info.iterations)))}
-    solver["chart_determinant_min"] = float(np.min(np.abs(np.asarray(map_.determinant(z)))))
-    defect = float(defects.max()) if len(defects) else None
-    return {"symplecticity_defect": defect, "unsolved": float(np.mean(~solved)), **solver}
+    return {
+        "symplecticity_defect": float(defects.max()) if len(defects) else None,
+        "unsolved": float(np.mean(~solved)),
+        "chart_determinant_min": float(np.min(np.abs(np.asarray(map_.determinant(z))))),
+        "newton_iterations_max": int(np.max(np.asarray(info.iterations))),
+    }
 
 
 def _rms(data: SharedData, images) -> float:
@@ -249,8 +265,13 @@ def compare(
     job["version"] = versions()["gfnn_jax"]
     if output.resume and _already_done(output.out, job, chosen):
         return None
-    given = {"overwrite": output.overwrite, "resume": output.resume}
-    with outputs.unfinished(output.out, job, what="comparison", **given) as kept_in:
+    with outputs.unfinished(
+        output.out,
+        job,
+        what="comparison",
+        overwrite=output.overwrite,
+        resume=output.resume,
+    ) as kept_in:
         data = SharedData(scene, seed, quick)
         for method in chosen:
             if (kept_in / f"{method}.json").exists():
@@ -259,8 +280,10 @@ def compare(
             try:
                 part, rollouts = learn_and_roll(method, data, cap * RATE, progress)
             except ValueError as error:  # the results of the other methods are kept
-                ways = "leave it out with --methods; --resume keeps the others"
-                raise WorkError(f"{TITLES[method]}: {error} ({ways})") from error
+                raise WorkError(
+                    f"{TITLES[method]}: {error} (leave it out with --methods; --resume keeps the "
+                    "others)"
+                ) from error
             _keep(kept_in, method, part, rollouts)
             seconds, error = part["fit"]["seconds"], part["fit"]["validation_rms"]
             progress.line(f"{TITLES[method]}: one-step error {error:.2e}, {seconds:.1f} s")
@@ -270,19 +293,37 @@ def compare(
             part, rollouts = _kept(kept_in, method)
             rollouts = without_runaways(rollouts, data.reference)
             measured[TITLES[method]] = m = measure(rollouts, scene, data.reference)
-            kl = divergences(scene, m.predicted, data.reference)
-            told = {"rollout": m.report, "curve": _curve(m.error), "kl": kl, "elements": None}
-            if scene.name == "two-body":
-                ends = m.predicted, data.reference
-                kinds = metrics.ELEMENTS.items()
-                off = {n: metrics.absolute_error(*map(f, ends)) for n, f in kinds}
-                told["elements"] = {n: _curve(error) for n, error in off.items()}
-            reported[method] = {"title": TITLES[method], **part, **told}
-        source = {"source": "reference data of the scene", "num_pairs": data.num_pairs}
-        source["digest"] = pairs_digest(data.fresh)
-        result = {"scene": name, "dt": scene.dt, "seed": seed, "dtype": "float64"}
-        result |= {"device": report.device(), "versions": versions(), "quick": quick, "cap": cap}
-        result |= {"data": source, "kl_bins": BINS, "job": job, "methods": reported}
+            reported[method] = {
+                "title": TITLES[method],
+                **part,
+                "rollout": m.report,
+                "curve": _curve(m.error),
+                "kl": divergences(scene, m.predicted, data.reference),
+                "elements": None
+                if scene.name != "two-body"
+                else {
+                    name: _curve(metrics.absolute_error(of(m.predicted), of(data.reference)))
+                    for name, of in metrics.ELEMENTS.items()
+                },
+            }
+        result = {
+            "scene": name,
+            "dt": scene.dt,
+            "seed": seed,
+            "dtype": "float64",
+            "device": report.device(),
+            "versions": versions(),
+            "quick": quick,
+            "cap": cap,
+            "data": {
+                "source": "reference data of the scene",
+                "num_pairs": data.num_pairs,
+                "digest": pairs_digest(data.fresh),
+            },
+            "kl_bins": BINS,
+            "job": job,
+            "methods": reported,
+        }
         with outputs.atomic_folder(output.out) as folder:
             for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")

@@ -84,8 +84,10 @@ def _errors(scene: Scene, measured: dict[str, Measured], reference) -> dict[str,
         drawn["energy"] = figures.energy_error({n: (steps, e) for n, e in energies.items()}).figure
     if scene.name == "two-body":
         both = metrics.ELEMENTS.values()
-        ends = [(n, [(f(m.predicted), f(reference)) for f in both]) for n, m in measured.items()]
-        elements = {n: (steps, *(metrics.absolute_error(*pair) for pair in of)) for n, of in ends}
+        elements = {
+            n: (steps, *(metrics.absolute_error(f(m.predicted), f(reference)) for f in both))
+            for n, m in measured.items()
+        }
         drawn["elements"] = figures.element_errors(elements)[0].figure
     return drawn
 

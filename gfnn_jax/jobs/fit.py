@@ -96,16 +96,26 @@ def fit(
         return None
     for text in summary(trajectories):
         progress.line(text)
-    own_dt = None if np.ndim(trajectories.dt) else trajectories.dt
-    job = {"command": "fit", "data": trajectories.digest, "dt": own_dt, "scene": scene_name}
-    job |= asked.deciding
+    job = {
+        "command": "fit",
+        "data": trajectories.digest,
+        "dt": None if np.ndim(trajectories.dt) else trajectories.dt,
+        "scene": scene_name,
+        **asked.deciding,
+    }
     if output.holds(job):
         group.broadcast({})
         return None
     with output.unfinished(job) as kept_in:
         try:
-            watched = {"progress": progress, "spent": reading, "kept": (kept_in, job)}
-            fitted = search(trajectories.pairs(), scene, asked, **watched)
+            fitted = search(
+                trajectories.pairs(),
+                scene,
+                asked,
+                progress=progress,
+                spent=reading,
+                kept=(kept_in, job),
+            )
             why, again = why_not(fitted.map), None
             if fitted.chosen.learns == "hamiltonian" and anything_told(asked.terms):
                 why = "a refit keeps nothing that is told of coefficients"
@@ -113,22 +123,37 @@ def fit(
                 assert trajectories.sampled is not None
                 seconds = work_of_refit(fitted, trajectories.sampled, reading)
                 why = f"no time, it would take about {seconds:.2g} s"
-                apart = {"test": fitted.test_pairs, "scene": scene, "group": group}
                 last = fitted.budget.last(_TO_ALL, READING, seconds, decides=True)
                 progress.status("fitting the chosen model to all pairs")
                 with failures_of_arithmetic(), row_blocks.on_devices(own):
-                    held = fitted.validation_pairs
-                    again = within(last, partial(refit, fitted, pairs, held, **apart))
+                    again = within(
+                        last,
+                        partial(
+                            refit,
+                            fitted,
+                            pairs,
+                            fitted.validation_pairs,
+                            test=fitted.test_pairs,
+                            scene=scene,
+                            group=group,
+                        ),
+                    )
             if again is None:
                 group.broadcast({})
                 again = not_refitted(fitted, why) if large else fitted
             fitted = again
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
-            facts = ("source", "digest", "precision", "units")
-            told = {name: getattr(trajectories, name) for name in facts}
-            params = {n: _range(v) for n, v in (trajectories.args or {}).items()}
-            result = fitted.report(data={**told, "dt": _range(trajectories.dt), "params": params})
+            result = fitted.report(
+                data={
+                    "source": trajectories.source,
+                    "digest": trajectories.digest,
+                    "precision": trajectories.precision,
+                    "units": trajectories.units,
+                    "dt": _range(trajectories.dt),
+                    "params": {n: _range(v) for n, v in (trajectories.args or {}).items()},
+                },
+            )
         except KeyboardInterrupt as stop:
             if note := publish(kept_in / BEST, output.out):
                 stop.add_note(note)
@@ -181,8 +206,10 @@ def fit_recording(
     named = not of_states or columns.get("positions") or columns.get("columns")
     for path in () if named else data:
         if Path(path).suffix in (".npy", ".npz"):
-            told = "expected columns with names, --states A,B. Of arrays, in Python: "
-            raise InputError(f'{path}: {told}gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))')
+            raise InputError(
+                f"{path}: expected columns with names, --states A,B. Of arrays, in Python: "
+                'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
+            )
     with refusals():
         asked = FitOptions(**options)
     recording = read(list(data), **columns)

@@ -97,9 +97,10 @@ def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead)
             own = measured.times(_same_run(measured, run))
             times = own[own > last][:num_steps]
             if not len(times):
-                told = f"holds no sample of run {run} after the end of {initial}, {last:g} s"
-                advice = "To forecast a part of one file, end it by --to"
-                raise InputError(f"{asked.compare}: {told}. {advice}")
+                raise InputError(
+                    f"{asked.compare}: holds no sample of run {run} after the end of {initial}, "
+                    f"{last:g} s. To forecast a part of one file, end it by --to"
+                )
         found[run] = forecast(known.map, part, times, ahead)
     compared = None if measured is None else _compared(known, found, measured)
     second = SECONDS[recording.time_unit]
@@ -140,11 +141,15 @@ class _Model:
     def _roles(self, channels: tuple[str, ...]) -> dict[str, Any]:
         """Keywords of `gfnn_jax.read` for a recording with these columns."""
         positions, speeds = self.sensors.positions, self.sensors.observation_model.speeds
-        roles = {"positions": tuple(n for n in channels if n in positions)}
-        roles["velocities"] = tuple(n for n in channels if n in speeds)
-        roles["sensors"] = tuple(n for n in channels if n not in (*positions, *speeds))
-        roles |= {"inputs": self.sensors.inputs, "coordinates": positions}
-        return {**roles, "angles": self.sensors.angles, **self.columns}
+        return {
+            "positions": tuple(n for n in channels if n in positions),
+            "velocities": tuple(n for n in channels if n in speeds),
+            "sensors": tuple(n for n in channels if n not in (*positions, *speeds)),
+            "inputs": self.sensors.inputs,
+            "coordinates": positions,
+            "angles": self.sensors.angles,
+            **self.columns,
+        }
 
 
 def _same_run(measured: Recording, run: str) -> str:

@@ -41,8 +41,10 @@ def look(
 def _of_states(paths: Sequence[Path], options: Mapping[str, Any]) -> Recording:
     """The recording of one array file of trajectories, a run each."""
     if len(paths) > 1 or set(options) - {"dt"}:
-        which = "holds states q, p in an array: look at one such file, without column options"
-        raise InputError(f"{paths[0]}: {which}")
+        raise InputError(
+            f"{paths[0]}: holds states q, p in an array: look at one such file, without column "
+            "options"
+        )
     data = read_trajectories(paths[0], dt=options.get("dt"), fewest=1)
     if max(data.lengths) < 3 or np.ndim(data.dt):
         raise InputError(f"{paths[0]}: expected runs of states at one time step, got pairs")

@@ -131,8 +131,13 @@ def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray, params=None
     roundoff = _ROUNDINGS * np.finfo(float).eps * float(np.max(sizes(reference[:, 0])))
     of_model = float(np.nanmean(error[:, 1])) > roundoff
     growth = metrics.growth_exponent(steps, error) if scene.regular and of_model else None
-    own = {"seconds": rollouts.seconds, "status": rollouts.status, "growth": growth, "drift": drift}
-    part = report.rollout_part(statistics=metrics.error_statistics(error), **own)
+    part = report.rollout_part(
+        seconds=rollouts.seconds,
+        status=rollouts.status,
+        statistics=metrics.error_statistics(error),
+        growth=growth,
+        drift=drift,
+    )
     return Measured(steps, predicted, error, energy, part)
 
 

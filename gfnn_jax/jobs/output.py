@@ -52,8 +52,9 @@ class Output:
 
     def unfinished(self, job: dict[str, Any]) -> AbstractContextManager[Path]:
         """Open the folder in which this job keeps its work (`storage.outputs.unfinished`)."""
-        asked = {"overwrite": self.overwrite, "resume": self.resume}
-        return unfinished(self.out, job, what=job["command"], **asked)
+        return unfinished(
+            self.out, job, what=job["command"], overwrite=self.overwrite, resume=self.resume
+        )
 
     def holds(self, job: dict[str, Any], model: str = ".") -> bool:
         """Return whether a resumed job had already finished, by the record of its model."""
@@ -149,8 +150,10 @@ def refuse_other_units(recording: Recording, job: dict[str, Any]) -> None:
         angles = all(unit.strip().lower().startswith(_ANGLES) for unit in (own, known))
         same = angles and own.partition("/")[2] == known.partition("/")[2]
         if own and known and own != known and not same:
-            learned = f"expected {name} in {known}, in which the model was learned"
-            raise InputError(f"{recording.source}: {learned}, got {own}")
+            raise InputError(
+                f"{recording.source}: expected {name} in {known}, in which the model was learned, "
+                f"got {own}"
+            )
 
 
 BEST = "best"
@@ -177,10 +180,17 @@ def search(
         checkpoints, factors = TrainingCheckpoints(kept_in, job), KeptFactors(kept_in)
         on_better = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
-        hooks: dict[str, Any] = {"checkpoints": checkpoints, "factors": factors}
-        hooks |= {"on_progress": progress.status, "on_better": on_better}
-        hooks["on_candidate"] = lambda candidate: progress.line(line(candidate))
-        return fit(data, scene, options=options, spent=spent, **hooks)
+        return fit(
+            data,
+            scene,
+            options=options,
+            spent=spent,
+            checkpoints=checkpoints,
+            factors=factors,
+            on_progress=progress.status,
+            on_candidate=lambda candidate: progress.line(line(candidate)),
+            on_better=on_better,
+        )
 
 
 def _keep(
@@ -202,9 +212,11 @@ def line(candidate: Candidate) -> str:
     The error is estimated from the gradient's residual until steps have validated it.
     """
     first = "" if candidate.validated else "first estimated at "
-    error, count = candidate.validation_relative, candidate.num_parameters
-    about = f"{error:.2e} of the spread, {count} parameters"
-    return f"{candidate.chart} {candidate.label}: one-step error {first}{about}"
+    return (
+        f"{candidate.chart} {candidate.label}: one-step error {first}"
+        f"{candidate.validation_relative:.2e} of the spread, "
+        f"{candidate.num_parameters} parameters"
+    )
 
 
 @contextlib.contextmanager

@@ -62,8 +62,10 @@ class Steps:
     def check(self) -> None:
         """Raises InputError where the options contradict each other."""
         if self.save_every > abs(self.num_steps):
-            most = f"expected --save-every of at most {abs(self.num_steps)} (--num-steps)"
-            raise InputError(f"{most}, got {self.save_every}")
+            raise InputError(
+                f"expected --save-every of at most {abs(self.num_steps)} (--num-steps), got "
+                f"{self.save_every}"
+            )
         if self.horizon is not None and self.samples is None:
             raise InputError("--horizon needs --samples: the band is the spread of samples")
 
@@ -138,11 +140,13 @@ def predict(
             stepped = map_.sharded(asked.devices or "all")
         if isinstance(drawn, Samples):
             drawn = Sharded(drawn, stepped.devices)
-    identity: dict[str, Any] = {"model": saved.digest(model), "initial": digest_of(*begin)}
-    identity["outside"] = asked.outside or "continue"
-    if drawn is not None:
-        identity |= {"samples": asked.samples, "horizon_size": asked.horizon}
-    identity |= {"block": stepped.block} if isinstance(stepped, Sharded) else {}
+    identity = {
+        "model": saved.digest(model),
+        "initial": digest_of(*begin),
+        "outside": asked.outside or "continue",
+        **({} if drawn is None else {"samples": asked.samples, "horizon_size": asked.horizon}),
+        **({"block": stepped.block} if isinstance(stepped, Sharded) else {}),
+    }
     job = _Prediction(map_, stepped, drawn, band, asked, output)
     if share is None or not isinstance(stepped, Sharded):
         return job.written(output.out, begin, identity)
@@ -211,11 +215,15 @@ def _states_of(map_: SymplecticMap, model: Path, initial: Path) -> tuple[np.ndar
         z0 = np.array([recording.array("positions", run)[-1] for run in recording.runs])
         params = np.array([args_of(recording, run, own) for run in recording.runs]) if own else None
     if names and params is None:
-        told = f"expected the parameters {', '.join(names)} of these states: a text file with their"
-        raise InputError(f"{initial}: {told} columns, or an .npz with z0 and an array of each name")
+        raise InputError(
+            f"{initial}: expected the parameters {', '.join(names)} of these states: a text file "
+            "with their columns, or an .npz with z0 and an array of each name"
+        )
     if z0.ndim != 2 or z0.shape[1] != bracket.size or not np.isfinite(z0).all():
-        wanted = f"states {', '.join(bracket.labels)} that are finite"
-        raise InputError(f"{initial}: expected {wanted}, got an array {z0.shape}")
+        raise InputError(
+            f"{initial}: expected states {', '.join(bracket.labels)} that are finite, got an array "
+            f"{z0.shape}"
+        )
     try:
         bracket.require_inside(z0)
     except FitError as error:
@@ -263,17 +271,24 @@ class _Prediction:
             if TIME in names:
                 drive = params[:, -1], float(np.asarray(parameters.period))
                 own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
-        asked, dt = self.asked, abs(float(self.map.dt))
-        bands = self.drawn is not None
-        known = asked.num_steps, dt, asked.save_every, bands, own, drive
-        return predictions.PredictionJob(identity, begin.z0.shape, *known)
+        return predictions.PredictionJob(
+            identity,
+            begin.z0.shape,
+            self.asked.num_steps,
+            abs(float(self.map.dt)),
+            self.asked.save_every,
+            self.drawn is not None,
+            own,
+            drive,
+        )
 
     def written(self, out: Path, begin: _Begin, identity: dict[str, Any]) -> Predicted:
         """Predict these lanes into one file."""
         output, asked = self.output, self.asked
         job = self.request(begin, identity)
-        ways = {"resume": output.resume, "overwrite": output.overwrite}
-        writer = predictions.PredictionWriter(out, job, **ways)
+        writer = predictions.PredictionWriter(
+            out, job, resume=output.resume, overwrite=output.overwrite
+        )
         started = time.perf_counter()
         if writer.finished:
             return _finished(out)
@@ -291,8 +306,10 @@ class _Prediction:
         except KeyboardInterrupt as stop:
             if not writer.finished:
                 done = max(0, writer.saved - 1) * asked.save_every
-                kept = f"{writer.partial} keeps {done} of {abs(asked.num_steps)} steps"
-                stop.add_note(f"{kept}: --resume goes on with it")
+                stop.add_note(
+                    f"{writer.partial} keeps {done} of {abs(asked.num_steps)} steps: --resume goes "
+                    "on with it"
+                )
             raise
         return Predicted(status, left_at, time.perf_counter() - started, passed)
 
@@ -323,9 +340,10 @@ class _Prediction:
         while writer.saved < writer.total:
             done = writer.saved - begun
             left = (time.perf_counter() - started) * (writer.total - writer.saved) / max(done, 1)
-            about = f", about {left:.0f} s left" if done else ""
-            step = f"step {(writer.saved - 1) * asked.save_every} of {abs(asked.num_steps)}"
-            self.output.progress.status(f"{step}{about}")
+            self.output.progress.status(
+                f"step {(writer.saved - 1) * asked.save_every} of {abs(asked.num_steps)}"
+                + (f", about {left:.0f} s left" if done else "")
+            )
             count = min(chunk, writer.total - writer.saved)
             lanes, states = self.stepped.advance(lanes, count, **options)
             if drawn is not None and of_samples is not None:

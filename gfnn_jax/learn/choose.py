@@ -226,9 +226,12 @@ def _stated(chosen: Chosen, found: Searched, by: str, rows, images) -> Chosen:
     """The error of these rows' images (n, 2d) in the user's coordinates."""
     error = measured_error(found.data, found.tolerance, images, rows)
     error = error._replace(bound=float(np.hypot(error.bound, _of_steps(chosen, found))))
-    candidate, told = with_error(chosen.candidate, error), _stated_by(by, found, rows)
-    few = of_few(error_of_each(found.data, found.tolerance, images, rows), found.tolerance)
-    return chosen._replace(candidate=candidate, by=by, stated_by=told, few=few)
+    return chosen._replace(
+        candidate=with_error(chosen.candidate, error),
+        by=by,
+        stated_by=_stated_by(by, found, rows),
+        few=of_few(error_of_each(found.data, found.tolerance, images, rows), found.tolerance),
+    )
 
 
 def _stated_by(by: str, found: Searched, rows: np.ndarray) -> str:
@@ -240,8 +243,10 @@ def _stated_by(by: str, found: Searched, rows: np.ndarray) -> str:
     if by == "test":
         return f"{count} that took no part in the fit or its choices"
     if by == "cross-validation":
-        told = f"{count}, each predicted by a fit without its fifth (cross-validation)"
-        return f"{told}; some of them chose the model's size"
+        return (
+            f"{count}, each predicted by a fit without its fifth (cross-validation); some of them "
+            "chose the model's size"
+        )
     return f"{count} that also chose the model"
 
 
@@ -272,9 +277,11 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
     if not FEW * np.median(errors) < rms < np.inf or rms < OPTIONS.matters * tolerance.bound:
         return ""
     unit = " of the spread" if tolerance.relative else ""
-    most = f"nine of ten err by less than {np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}"
-    bound = "The 95 % bound of the RMS does not hold for other states: quote that of nine of ten"
-    return f"few states make most of the error: {most}. {bound}"
+    return (
+        "few states make most of the error: nine of ten err by less than "
+        f"{np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}. The 95 % bound of the RMS does not "
+        "hold for other states: quote that of nine of ten"
+    )
 
 
 def _by_folds(
@@ -384,11 +391,14 @@ def with_test_rows(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
     if not again.validation_rms <= sweep.solve(size)[0].validation_rms:
         return chosen
     params = jax.tree.map(np.asarray, size.family.unflatten(again.coefficients))
-    fitted = [isinstance(piece, Generated) for piece in candidate.map.pieces]
-    own = {"params": jax.device_put(params)}
-    each = zip(candidate.map.pieces, fitted, strict=True)
-    pieces = tuple(dataclasses.replace(p, **own) if is_s else p for p, is_s in each)
+    pieces = tuple(
+        dataclasses.replace(piece, params=jax.device_put(params))
+        if isinstance(piece, Generated)
+        else piece
+        for piece in candidate.map.pieces
+    )
     map_ = dataclasses.replace(candidate.map, pieces=pieces)
-    candidate = dataclasses.replace(candidate, map=map_)
-    told = f"{chosen.stated_by}; the map is fitted to them too"
-    return chosen._replace(candidate=candidate, stated_by=told)
+    return chosen._replace(
+        candidate=dataclasses.replace(candidate, map=map_),
+        stated_by=f"{chosen.stated_by}; the map is fitted to them too",
+    )

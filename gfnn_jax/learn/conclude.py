@@ -69,11 +69,13 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         cut = request.budget.ended or (law.ended if law is not None else "")
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
-        ended = "the map meets the tolerance on the pairs that chose it, and not on the test pairs,"
-        ended += " which chose nothing: more pairs narrow the bound"
-        if not np.isfinite(candidate.validation_relative):
-            ended = "the implicit step of the map that should meet it fails for some of the states:"
-            ended += " a smaller dt, or a smaller region, helps"
+        ended = (
+            "the map meets the tolerance on the pairs that chose it, and not on the test pairs, "
+            "which chose nothing: more pairs narrow the bound"
+            if np.isfinite(candidate.validation_relative)
+            else "the implicit step of the map that should meet it fails for some of the states: "
+            "a smaller dt, or a smaller region, helps"
+        )
     if met and not ended.startswith(MET):  # by the pairs that state the error
         ended = MET
     if law is not None and searched.of_terms is None and searched.linear is None:
@@ -131,9 +133,11 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     if found is None:
         return []
     change, error = found
-    told = f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by"
-    told += " friction. The map keeps volumes: it meets the tolerance of one step, and long"
-    return [f"{told} rollouts miss the decay. With a smaller --tolerance a fit looks for friction"]
+    return [
+        f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by "
+        "friction. The map keeps volumes: it meets the tolerance of one step, and long rollouts "
+        "miss the decay. With a smaller --tolerance a fit looks for friction"
+    ]
 
 
 def _with_clock(ended: str, budget: Budget) -> str:
@@ -348,7 +352,9 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     few = max(1, Options.noise_numbers // (2 * data.dim))
     rows = np.sort(data.training)[:few]
     noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
-    noises = f"noise of about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta"
-    others = "other terms of the structure are no more accurate: the residuals are"
-    message = f"{others} {noises}, or terms that were not tried (give known ones: --terms)"
+    message = (
+        "other terms of the structure are no more accurate: the residuals are noise of about "
+        f"{noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or terms that were not tried "
+        "(give known ones: --terms)"
+    )
     return _LeftOver(noise, [message])

@@ -105,10 +105,16 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
             if of_map:
                 return _told(learn_positions(pairs, options, watch))
             try:
-                names = ("friction", "input_hold", "mass", "loss", "hidden")
-                asked = {name: getattr(options, name) for name in names}
-                terms, report = tuple(options.terms), watch.on_progress
-                law = fit_recording(pairs, terms=terms, on_progress=report, **asked)
+                law = fit_recording(
+                    pairs,
+                    friction=options.friction,
+                    input_hold=options.input_hold,
+                    mass=options.mass,
+                    terms=tuple(options.terms),
+                    loss=options.loss,
+                    hidden=options.hidden,
+                    on_progress=watch.on_progress,
+                )
             except FitError as error:
                 if error.fit is not None:
                     error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict}, pairs)
@@ -134,8 +140,10 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
         warn(about_pairs)
         count = len(request.pairs)
         if not_looked_at := count - len(looked_for_errors(count)):
-            told = f"the search for outliers in {not_looked_at:,} of {count:,} pairs"
-            budget.leave_out(told, "those that the final map misses by far are found at the end")
+            budget.leave_out(
+                f"the search for outliers in {not_looked_at:,} of {count:,} pairs",
+                "those that the final map misses by far are found at the end",
+            )
         data = data.divided(options.seed)
         for asked, same in structures_to_try(request, data):
             request, data = asked, same
@@ -164,18 +172,32 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
     if damping is not None:  # a fact, not a warning
         messages.append(damping.line(data.dt))
     num_states = min(STATES_MEASURED, block_of(2 * data.dim))
-    facts: dict[str, Any] = {"pairs": data.pairs, "num_pairs": len(data), "scene": scene}
-    facts |= {"validation_pairs": data.pairs.take(data.validation), "seed": options.seed}
-    facts |= {"test_pairs": data.pairs.take(data.test) if len(data.test) else None}
-    facts |= {"determinants": found.charts.determinants, "data_defect": diagnosis.data_defect}
-    facts |= {"base_map": bool(chosen.data.before or chosen.data.after), "damping": damping}
-    facts |= {"noise": conclusion.noise, "ended": conclusion.ended, "white": conclusion.white}
-    facts |= {"messages": tuple(messages), "symmetries": symmetries, "hamiltonian": found.law}
-    facts |= {"partial_laws": () if found.met_by_law else tuple(request.partial_laws)}
-    facts |= {"compile_seconds": chosen.compile_seconds, "stated_by": chosen.stated_by}
-    facts |= {"model_determinant_min": _smallest_determinant(chosen), "asked": request.tolerance}
-    tested = chosen.data.pairs.take(chosen.data.validation[:num_states])
-    choice = Choice.of(budget, tested, candidates=_all_candidates(chosen, found), **facts)
+    choice = Choice.of(
+        budget,
+        chosen.data.pairs.take(chosen.data.validation[:num_states]),
+        candidates=_all_candidates(chosen, found),
+        asked=request.tolerance,
+        num_pairs=len(data),
+        validation_pairs=data.pairs.take(data.validation),
+        determinants=found.charts.determinants,
+        data_defect=diagnosis.data_defect,
+        base_map=bool(chosen.data.before or chosen.data.after),
+        hamiltonian=found.law,
+        noise=conclusion.noise,
+        messages=tuple(messages),
+        ended=conclusion.ended,
+        compile_seconds=chosen.compile_seconds,
+        model_determinant_min=_smallest_determinant(chosen),
+        pairs=data.pairs,
+        scene=scene,
+        damping=damping,
+        symmetries=symmetries,
+        partial_laws=() if found.met_by_law else tuple(request.partial_laws),
+        stated_by=chosen.stated_by,
+        test_pairs=data.pairs.take(data.test) if len(data.test) else None,
+        white=conclusion.white,
+        seed=options.seed,
+    )
     return Fit(chosen.candidate.map, choice)
 
 
@@ -190,9 +212,10 @@ def _refuse_others(changes: Mapping[str, Any]) -> None:
     """Raises TypeError where a keyword says what columns are, or is none of `FitOptions`."""
     roles = {*ReadOptions.__annotations__} - {"angles"}
     for name in roles & {*changes}:
-        told = f"fit: unexpected keyword argument '{name}': it belongs to the data. Give it to "
-        told += f"gfnn.read(path, {name}=…) or gfnn.Recording(table, {name}=…), and fit what they"
-        raise TypeError(f"{told} give")
+        raise TypeError(
+            f"fit: unexpected keyword argument '{name}': it belongs to the data. Give it to "
+            f"gfnn.read(path, {name}=…) or gfnn.Recording(table, {name}=…), and fit what they give"
+        )
     for name in {*changes} - {*OPTIONS}:
         raise TypeError(unexpected("fit", name, [*OPTIONS]))
 
@@ -220,8 +243,10 @@ def as_pairs_or_recording(
     if more is None and isinstance(data, tuple) and len(data) == 2:
         data, more = data
     if more is None:
-        wanted = "gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x)"
-        raise FitError(f"expected {wanted}, got {type(data).__name__}")
+        raise FitError(
+            "expected gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x), "
+            f"got {type(data).__name__}"
+        )
     return _of_arrays(data, more), None
 
 
@@ -265,8 +290,11 @@ def _devices(devices: int | str | None) -> tuple[Any, ...]:
 
 def _all_candidates(chosen: Chosen, found: Searched) -> tuple[Candidate, ...]:
     """Every candidate by rising operations, the chosen one as its own steps showed it."""
-    own = None if chosen.entry is None else chosen.entry.size
-    others = [e.candidate for e in found.found.entries if own is None or e.size is not own]
+    others = [
+        e.candidate
+        for e in found.found.entries
+        if chosen.entry is None or e.size is not chosen.entry.size
+    ]
     if found.law is not None and chosen.candidate.learns == "map":
         others.append(found.law.candidate)
     candidates = [*others, dataclasses.replace(chosen.candidate, chosen=True, map=None)]

@@ -71,10 +71,12 @@ class OfPositions:
         left = self.num_parameters - self.rank
         kind = "symmetric, as S of a reversible map is" if self.symmetric else "of no symmetry"
         listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
-        told = f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions"
-        told += " do not determine its scale: momenta, energies and areas have a unit of their own"
-        told += f". {left} undetermined combinations of terms are 0" if left else ""
-        return told + (f". The noise of the readings is {listed}" if listed else "")
+        return (
+            f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "
+            "do not determine its scale: momenta, energies and areas have a unit of their own"
+            + (f". {left} undetermined combinations of terms are 0" if left else "")
+            + (f". The noise of the readings is {listed}" if listed else "")
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,16 +141,22 @@ class Choice:
     @classmethod
     def of(cls, budget: Budget, tested: Pairs, **known: Any) -> Choice:
         """Make the one that this budget paid for, with the pairs that its map is measured at."""
-        spent = {"seconds": budget.seconds, "operations": budget.operations, "budget": budget}
-        args, states = tested.args, np.asarray(tested.z0)
-        return cls(test_states=states, test_args=args, **spent, **known)
+        return cls(
+            test_states=np.asarray(tested.z0),
+            test_args=tested.args,
+            seconds=budget.seconds,
+            operations=budget.operations,
+            budget=budget,
+            **known,
+        )
 
     @property
     def law(self) -> LearnedHamiltonian | None:
         """H, where one was found that meets the tolerance or was chosen."""
         law = self.hamiltonian
-        chosen = self.chosen.learns == "hamiltonian"
-        known = law is not None and (chosen or self.asked.met_by(law.candidate))
+        known = law is not None and (
+            self.chosen.learns == "hamiltonian" or self.asked.met_by(law.candidate)
+        )
         return law if known else None
 
     @property
@@ -174,8 +182,10 @@ class Choice:
             return f"one of several: {self.several}"
         relative = self.chosen.validation_relative
         if relative > _Options.hides:
-            hides = f"noise of {relative:.0%} of the spread in a step hides what another law"
-            return f"one of several: {hides} would leave"
+            return (
+                f"one of several: noise of {relative:.0%} of the spread in a step hides what "
+                "another law would leave"
+            )
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         if rivals:
             return f"one of several: {'; '.join(rivals)} is as likely"
@@ -290,8 +300,10 @@ class Fit:
         """The recording that the law was learned from. Raises ValueError where a folder gave the
         fit, which holds no data, and for a fit of pairs."""
         if self.data is None:
-            told = "expected a fit that has its recording, and a folder holds none"
-            raise ValueError(f"{told}: give it, as in fit.forecast(times, after=gfnn.read(FILE))")
+            raise ValueError(
+                "expected a fit that has its recording, and a folder holds none: give it, as in "
+                "fit.forecast(times, after=gfnn.read(FILE))"
+            )
         return self.data if self.learned_to is None else self.data.slice(stop=self.learned_to)
 
     @property
@@ -371,8 +383,12 @@ class Fit:
                 found = getattr(own["found"], name)
                 return said(found) if isinstance(found, str) else found
             if hasattr(own["map"], name):
-                told = f"fit.{name} is fit.map.{name}: a fit is no map, and will not stand for it"
-                warnings.warn(f"{told} in the next version", DeprecationWarning, stacklevel=2)
+                warnings.warn(
+                    f"fit.{name} is fit.map.{name}: a fit is no map, and will not stand for it in "
+                    "the next version",
+                    DeprecationWarning,
+                    stacklevel=2,
+                )
                 return getattr(own["map"], name)
         known = [n for n in {*dir(type(self)), *dir(own.get("found"))} if not n.startswith("_")]
         near = difflib.get_close_matches(name, known, n=1)
@@ -534,9 +550,12 @@ class Fit:
         messages = self.budget.left_out[known:]
         for message in messages:
             warnings.warn(message, FitWarning, stacklevel=2)
-        told, seconds = (*self.messages, *messages), self.budget.seconds
-        known = defect is not None
-        found = self.replaced(map=map_, messages=told, defect_known=known, seconds=seconds)
+        found = self.replaced(
+            map=map_,
+            messages=(*self.messages, *messages),
+            defect_known=defect is not None,
+            seconds=self.budget.seconds,
+        )
         if defect is not None:
             found.__dict__["symplecticity_defect"] = defect
         return found
@@ -570,14 +589,21 @@ def candidate_cells(found: Choice | Fit) -> tuple[tuple[str, ...], list[tuple[st
     """
     bound = "95 % bound" if found.asked.relative else "95 % bound (absolute)"
     numbers = ("parameters", "error ÷ spread", bound, "outside", "kflop/step", "µs/step", "fit s")
-    rows = []
-    for c in found.candidates:
-        about = "" if c.validated else "~"
-        outside = "–" if c.outside is None else f"{c.outside:.1e}"
-        micro = "–" if c.microseconds_per_step is None else f"{c.microseconds_per_step:.2f}"
-        named = "→" if c.chosen else "", c.chart, c.label, f"{c.num_parameters:,}"
-        errors = f"{about}{c.validation_relative:.2e}", f"{about}{c.validation_bound:.2e}", outside
-        rows.append((*named, *errors, f"{c.operations / 1e3:.1f}", micro, f"{c.fit_seconds:.2f}"))
+    rows = [
+        (
+            "→" if c.chosen else "",
+            c.chart,
+            c.label,
+            f"{c.num_parameters:,}",
+            f"{'' if c.validated else '~'}{c.validation_relative:.2e}",
+            f"{'' if c.validated else '~'}{c.validation_bound:.2e}",
+            "–" if c.outside is None else f"{c.outside:.1e}",
+            f"{c.operations / 1e3:.1f}",
+            "–" if c.microseconds_per_step is None else f"{c.microseconds_per_step:.2f}",
+            f"{c.fit_seconds:.2f}",
+        )
+        for c in found.candidates
+    ]
     return ("", "chart", "family", *numbers), rows
 
 

@@ -132,12 +132,16 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         found = again
     messages = []
     if len(wrong):
-        told = f"{_named(wrong, count)} are far from the map of the others: outliers, or states at"
-        advice = "They are left out. If they are right, add pairs there"
-        messages.append(f"{told} the edge of the data that it cannot follow. {advice}")
+        messages.append(
+            f"{_named(wrong, count)} are far from the map of the others: outliers, or states at "
+            "the edge of the data that it cannot follow. They are left out. If they are right, add "
+            "pairs there"
+        )
     if len(rim):
-        told = f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them"
-        messages.append(f"{told}: the map is fitted, and its error stated, without them")
+        messages.append(
+            f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them: the "
+            "map is fitted, and its error stated, without them"
+        )
     return found, messages
 
 

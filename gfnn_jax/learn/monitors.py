@@ -105,9 +105,10 @@ def fit_monitors(
         raise InputError("between: expected some stretches that are known, and some None")
     lost = [k for k in range(len(places)) if known[k] is None and known[k - 1] is None]
     if lost:
-        places = f"place {', '.join(str(k + 1) for k in lost)} has no known stretch on either side"
-        advice = "Give one (between=), or leave the place out"
-        raise InputError(f"{places}, so that its momenta are unknown. {advice}")
+        raise InputError(
+            f"place {', '.join(str(k + 1) for k in lost)} has no known stretch on either side, so "
+            "that its momenta are unknown. Give one (between=), or leave the place out"
+        )
     runs = [[_readings(recording, names, run) for names in places] for run in recording.runs]
     states = [_states(q, known) for q in runs]
     steps = np.concatenate([np.diff(recording.times(run)) for run in recording.runs])
@@ -171,18 +172,23 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
     else:
         matrix = np.asarray(stretch, float)
     if matrix.shape != (2 * dim, 2 * dim) or not np.isfinite(matrix).all():
-        known = f"a drift or a matrix of shape {(2 * dim, 2 * dim)}"
-        raise InputError(f"expected the length of {known}, got {np.shape(stretch)}")
+        raise InputError(
+            f"expected the length of a drift or a matrix of shape {(2 * dim, 2 * dim)}, got "
+            f"{np.shape(stretch)}"
+        )
     form = symplectic_form(dim)
     defect = np.abs(matrix.T @ form @ matrix - form).max()
     if not defect < _Options.symplectic * max(1.0, np.abs(matrix).max() ** 2):
-        got = f"got one with |MᵀJM − J| of {defect:.2g}"
-        raise InputError(f"between: expected symplectic matrices in q1…qd, p1…pd, {got}")
+        raise InputError(
+            f"between: expected symplectic matrices in q1…qd, p1…pd, got one with |MᵀJM − J| of "
+            f"{defect:.2g}"
+        )
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _Options.singular * max(values[0], 1e-300):
-        told = "the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of π), so"
-        told += " that two readings determine no momenta. Give another stretch as the known one"
-        raise InputError(f"between: {told}")
+        raise InputError(
+            "between: the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of "
+            "π), so that two readings determine no momenta. Give another stretch as the known one"
+        )
     return matrix
 
 
@@ -229,6 +235,11 @@ def _pairs(states: list[list[np.ndarray]], k: int, dt: float) -> Pairs:
 def _linear(matrix: np.ndarray, pairs: Pairs, like: SymplecticMap) -> SymplecticMap:
     """The map of a known stretch, in the coordinates of a learned one."""
     none = np.zeros(len(matrix))
-    known = {"coordinates": like.coordinates, "angle_centre": np.zeros(0), "dt": pairs.dt}
-    pieces, domain = (Affine(matrix, none, none),), covering(pairs.z0)
-    return SymplecticMap(pieces=pieces, domain=domain, scale=sizes(pairs.z0), **known)
+    return SymplecticMap(
+        pieces=(Affine(matrix, none, none),),
+        coordinates=like.coordinates,
+        domain=covering(pairs.z0),
+        scale=sizes(pairs.z0),
+        angle_centre=np.zeros(0),
+        dt=pairs.dt,
+    )

@@ -210,8 +210,9 @@ class NoisySweep(LinearSweep):
                 assert along is not None
                 sigma = np.where(np.isfinite(along.states), along.states, sigma)
             ends = data.before, data.after
-            given = size.family, self.chart, data.dt, arcs.moves, ends
-            model = GeneratedOnArcs(*given, coordinates=data.coordinates)
+            model = GeneratedOnArcs(
+                size.family, self.chart, data.dt, arcs.moves, ends, coordinates=data.coordinates
+            )
             return NearestArcs.of(model, coefficients, arcs, sigma)
 
         self._along = nearest

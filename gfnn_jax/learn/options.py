@@ -166,8 +166,10 @@ def told(terms: Sequence[Any] | Mapping[Any, Any]) -> Sequence[Any]:
         elif isinstance(value, (int, float, str)) and not isinstance(value, bool):
             texts.append(f"{term} = {value}")
         else:
-            wanted = "None, a number, gfnn.between(low, high), or a multiple of another term"
-            raise FitError(f"terms: expected {wanted} as text for {term}, got {value!r}")
+            raise FitError(
+                f"terms: expected None, a number, gfnn.between(low, high), or a multiple of "
+                f"another term as text for {term}, got {value!r}"
+            )
     return tuple(texts)
 
 

@@ -95,14 +95,21 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         each = law.noise_of(np.asarray(tested.z1))
         sigma = np.sqrt(np.mean(each**2, axis=0))
         white = bool(np.sqrt(np.mean((off / each) ** 2)) <= NOISE * np.sqrt(2))
-    family, count = learned.family, learned.family.num_parameters
-    named = {"label": learned.label, "family": family.name, "chart": learned.bracket.name}
-    named["learns"] = "map" if learned.law is None else "hamiltonian"
-    costs = {"num_parameters": count, "operations": float(family.operations[0])}
-    costs |= {"fit_seconds": seconds, "microseconds_per_step": steps.microseconds_per_step}
-    most, rms = int(steps.iterations.max()), learned.relative
-    told: dict[str, Any] = {"train_rms": rms, "newton_iterations_max": most, **named, **costs}
-    candidate = Candidate.of(error, validated=True, chosen=True, **told)
+    candidate = Candidate.of(
+        error,
+        label=learned.label,
+        family=learned.family.name,
+        chart=learned.bracket.name,
+        num_parameters=learned.family.num_parameters,
+        operations=float(learned.family.operations[0]),
+        train_rms=learned.relative,
+        validated=True,
+        fit_seconds=seconds,
+        chosen=True,
+        learns="map" if learned.law is None else "hamiltonian",
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )
     watch.on_candidate(candidate)
     met, messages = tolerance.met_by(candidate), [*left_out, *learned.notes]
     ended = MET if met else _NO_MORE
@@ -115,15 +122,26 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         messages.append(tolerance.missed_by(candidate, ended))
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
     tested = tested.take(slice(min(STATES_MEASURED, block_of(n))))
-    law = learned.law and _learned(learned.law, map_, candidate, messages)
-    known: dict[str, Any] = {"candidates": (candidate,), "hamiltonian": law, "asked": tolerance}
-    known |= {"several": learned.law.several if learned.law else "", "noise": sigma}
-    known |= {"messages": tuple(messages), "ended": ended, "white": white, "seed": options.seed}
-    known |= {"pairs": pairs, "validation_pairs": pairs.take(split.validation)}
-    known |= {"test_pairs": pairs.take(split.test) if len(split.test) else None}
-    known |= {"stated_by": f"{len(test):,} pairs that were not fitted to"}
-    known |= {"num_pairs": len(pairs) - len(test), "compile_seconds": steps.compile_seconds}
-    return Fit(map_, Choice.of(budget, tested, **known))
+    choice = Choice.of(
+        budget,
+        tested,
+        candidates=(candidate,),
+        asked=tolerance,
+        num_pairs=len(pairs) - len(test),
+        hamiltonian=learned.law and _learned(learned.law, map_, candidate, messages),
+        noise=sigma,
+        messages=tuple(messages),
+        ended=ended,
+        compile_seconds=steps.compile_seconds,
+        pairs=pairs,
+        stated_by=f"{len(test):,} pairs that were not fitted to",
+        validation_pairs=pairs.take(split.validation),
+        test_pairs=pairs.take(split.test) if len(split.test) else None,
+        white=white,
+        seed=options.seed,
+        several=learned.law.several if learned.law else "",
+    )
+    return Fit(map_, choice)
 
 
 def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:
@@ -136,23 +154,29 @@ def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:
         call = "gfnn.fit(pairs.take((pairs.z0 > 0).all(axis=1) & (pairs.z1 > 0).all(axis=1)))"
         if isinstance(data, Recording):
             call = "the same command, once these cells are empty"
-        why = f"Logarithms were not tried, for in {_rows(below)} a coordinate is not above 0"
-        return f". {why}. Without them: {call}"
+        return (
+            f". Logarithms were not tried, for in {_rows(below)} a coordinate is not above 0. "
+            f"Without them: {call}"
+        )
     if isinstance(data, Recording):
         if not all(map(is_rate_of_turning, data.positions)):
             return ". If these are positions: gfnn.fit(recording)"
         times = np.concatenate([data.times(run) for run in data.runs])
         first, last = np.quantile(times, [0.25, 0.75])
-        told = "A body has a law with a bracket while no hand, motor or dry friction turns it"
-        return f". {told}. Take that part of the runs, such as --from {first:.6g} --to {last:.6g}"
+        return (
+            ". A body has a law with a bracket while no hand, motor or dry friction turns it. Take "
+            f"that part of the runs, such as --from {first:.6g} --to {last:.6g}"
+        )
     n = pairs.z0.shape[1]
     if n % 2:
         spins = n // 3
         known = f"so3({spins if spins > 1 else ''})"
         if n % 3:
             known = f"lie({('so3',) * spins + ('centre',) * (n % 3)})"
-        call = f"gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=gfnn.Bracket.{known}))"
-        return f". H of a bracket that you know, for example: {call}"
+        return (
+            ". H of a bracket that you know, for example: "
+            f"gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=gfnn.Bracket.{known}))"
+        )
     call = "gfnn.fit(gfnn.Pairs(pairs.z0, pairs.z1, pairs.dt, run=pairs.run))"
     return f". As positions and momenta, with friction of any kind: {call}"
 
@@ -175,10 +199,11 @@ def pairs_of_states(recording: Recording) -> Pairs:
     if len(names) < 2:
         raise InputError(f"expected 2 or more columns of states, got {len(names)}: --positions A,B")
     if recording.inputs:
-        told = f"a law with a bracket has no inputs, got {', '.join(recording.inputs)}"
-        may = "It may depend on parameters, one number of each run, and on the time of a periodic"
-        drive = 'drive: gfnn.Pairs(z0, z1, dt, structure="poisson", t0=times, period=T)'
-        raise InputError(f"{told}. {may} {drive}")
+        raise InputError(
+            f"a law with a bracket has no inputs, got {', '.join(recording.inputs)}. It may depend "
+            "on parameters, one number of each run, and on the time of a periodic drive: "
+            'gfnn.Pairs(z0, z1, dt, structure="poisson", t0=times, period=T)'
+        )
     for number, run in enumerate(recording.runs):
         z, t = np.asarray(recording.array("positions", run)), recording.times(run)
         known = np.asarray(np.isfinite(z).all(axis=1))
@@ -191,8 +216,7 @@ def pairs_of_states(recording: Recording) -> Pairs:
     even = np.abs(dt - usual).max() <= EVEN * usual
     dt = usual if even else dt
     given = dict(zip(symbols(own), args.T, strict=True)) or None
-    known = {"run": run, "place": place, "structure": POISSON, "names": symbols(names)}
-    return Pairs(z0, z1, dt, given, **known)
+    return Pairs(z0, z1, dt, given, run=run, place=place, structure=POISSON, names=symbols(names))
 
 
 def _data_of(pairs: Pairs) -> Data:
@@ -215,13 +239,16 @@ def _checked(pairs: Any, bracket: Bracket | None) -> int:
         states.append(z)
     if bracket is not None:
         if bracket.size != states[0].shape[1]:
-            own = states[0].shape[1]
-            raise FitError(f"the bracket has {bracket.size} coordinates, the states have {own}")
+            raise FitError(
+                f"the bracket has {bracket.size} coordinates, the states have {states[0].shape[1]}"
+            )
         outside = bracket.outside(states[0]) | bracket.outside(states[1])
         if outside.any():
-            kept = "pairs.take(~(bracket.outside(pairs.z0) | bracket.outside(pairs.z1)))"
-            call = f"gfnn.fit({kept}, bracket=bracket)"
-            raise FitError(f"{bracket.undefined} in {_rows(outside)}. Without them: {call}")
+            raise FitError(
+                f"{bracket.undefined} in {_rows(outside)}. Without them: "
+                "gfnn.fit(pairs.take(~(bracket.outside(pairs.z0) | "
+                "bracket.outside(pairs.z1))), bracket=bracket)"
+            )
     return states[0].shape[1]
 
 
@@ -241,8 +268,10 @@ def _without_own_step(bracket: Bracket, pairs: Pairs) -> list[str]:
         return []
     known = Bracket.lie(own.blocks, sized(own, np.asarray(pairs.z0)))
     outside = known.outside(pairs.z0) | known.outside(pairs.z1)
-    told = f"{known.undefined} in {_rows(outside)}, where {known.name} has no step of its own"
-    return [f"{told}: the slower one of any Lie algebra was taken"]
+    return [
+        f"{known.undefined} in {_rows(outside)}, where {known.name} has no step of its own: the "
+        "slower one of any Lie algebra was taken"
+    ]
 
 
 def _given(terms, names: tuple[str, ...]) -> Terms | None:
@@ -251,8 +280,10 @@ def _given(terms, names: tuple[str, ...]) -> Terms | None:
     if not terms:
         return None
     if anything_told(terms):
-        told = "terms: values, bounds and ties of coefficients are of H of plain pairs, got states"
-        raise InputError(f"{told} with a bracket: give the terms without them")
+        raise InputError(
+            "terms: values, bounds and ties of coefficients are of H of plain pairs, got states "
+            "with a bracket: give the terms without them"
+        )
     texts = tuple(dict.fromkeys(to_named_text(parse_named(t, names), names) for t in terms))
     return Terms(0, texts, tuple(map(tuple, np.eye(len(texts), dtype=int).tolist())), (), names)
 
@@ -284,12 +315,15 @@ def _generated(data: Data, bracket: Bracket | None) -> _Learned:
     """The map without a law that S generates in the chart of a bracket. Raises FitError without a
     bracket, and for pairs of several dt, parameters or a drive."""
     if data.beside.names:
-        told = f"a map without a law is one of one system, got {', '.join(data.beside.names)}"
-        law = "gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
-        raise FitError(f"{told}. A law may depend on them: {law}")
+        raise FitError(
+            f"a map without a law is one of one system, got {', '.join(data.beside.names)}. A law "
+            "may depend on them: gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
+        )
     if bracket is None:
-        known = "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
-        raise FitError(f"a map without a law needs its bracket, such as {known}")
+        raise FitError(
+            "a map without a law needs its bracket, such as "
+            "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
+        )
     if np.ndim(data.dt):
         raise FitError("a map without a law is one of pairs with one dt")
     y0, y1 = (_inner(z, bracket) for z in (data.z0, data.z1))
@@ -310,8 +344,17 @@ def _map(piece, bracket: Bracket, data: Data, dt: float, posterior=None) -> Symp
     z, beside = data.z0[:, : bracket.size], data.beside
     domain, angles = covering(_inner(z, bracket)), np.zeros(0)
     given = sampled(beside.names, beside.values, dt, beside.period) if beside.names else None
-    known: dict[str, Any] = {"parameters": given, "posterior": posterior, "bracket": bracket}
-    return SymplecticMap((piece,), inner, domain, sizes(z), angles, dt, **known)
+    return SymplecticMap(
+        (piece,),
+        inner,
+        domain,
+        sizes(z),
+        angles,
+        dt,
+        parameters=given,
+        posterior=posterior,
+        bracket=bracket,
+    )
 
 
 def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
@@ -322,10 +365,16 @@ def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
     named = zip(names, law.fit.c, std, strict=True)
     every = [Term(name, float(c), float(s)) for name, c, s in named]
     terms = tuple(every[: law.field.library.num_parameters])
-    told = {"messages": tuple(messages), "friction": tuple(every[len(terms) :])}
-    flow, text, none = map_.pieces[0], formula(terms), float("nan")
-    root = law.fit.root
-    return LearnedHamiltonian(candidate, flow, terms, text, none, covariance=lambda: root, **told)
+    return LearnedHamiltonian(
+        candidate,
+        map_.pieces[0],
+        terms,
+        formula(terms),
+        float("nan"),
+        messages=tuple(messages),
+        covariance=lambda: law.fit.root,
+        friction=tuple(every[len(terms) :]),
+    )
 
 
 def _resistances(law: PoissonLaw) -> list[str]:

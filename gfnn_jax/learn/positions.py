@@ -81,9 +81,18 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
     if len(triples) < Options.fewest:
         raise FitError(f"expected at least {Options.fewest} triples, got {len(triples)}")
-    none, window = np.zeros(triples.dim), Options.window * triples.dt
-    columns, moves = (recording.positions, (), recording.angles), np.zeros((1, triples.dim))
-    sensors = Sensors(*columns, none, 0.0, window, "hold", 0.0, np.array([triples.dt]), moves)
+    sensors = Sensors(
+        recording.positions,
+        (),
+        recording.angles,
+        np.zeros(triples.dim),
+        0.0,
+        Options.window * triples.dt,
+        "hold",
+        0.0,
+        np.array([triples.dt]),
+        np.zeros((1, triples.dim)),
+    )
     sweep = _Sweep(triples, sites, _split(triples, options.seed), tolerance, budget, watch, sensors)
     best = sweep.best(symmetric=True)
     if best is None or not tolerance.met_by(best.candidate):
@@ -92,8 +101,10 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         if other is not None and (best is None or other.candidate.validation_bound < least):
             best = other
     if best is None:
-        told = f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved"
-        raise FitError(f"{told}. Add positions, or raise --max-seconds")
+        raise FitError(
+            f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
+            "positions, or raise --max-seconds"
+        )
     return sweep.learned(sweep.without_noise(best), left_out, options.seed)
 
 
@@ -193,15 +204,20 @@ class _Sweep:
         both = np.sort(split.training), np.sort(split.validation)
         training, held_out = map(self.triples.take, both)
         families = self._families(symmetric)
-        told = self.budget, self.watch.on_progress
-        found = latent_positions.without_noise(families, training, held_out, *told)
+        found = latent_positions.without_noise(
+            families, training, held_out, self.budget, self.watch.on_progress
+        )
         if found is None:
             return best
         started = time.perf_counter()
         noise = tuple(map(float, found.fit.sigma))
-        of_fit = {"rank": found.solved.rank, "condition": found.solved.condition, "noise": noise}
-        terms = found.family.num_parameters
-        about = dataclasses.replace(best.about, num_parameters=terms, **of_fit)
+        about = dataclasses.replace(
+            best.about,
+            num_parameters=found.family.num_parameters,
+            rank=found.solved.rank,
+            condition=found.solved.condition,
+            noise=noise,
+        )
         own = found.fit.coefficients, found.fit.root, found.fit.sigma
         return self._found(found.family, about, *own, started)
 
@@ -231,10 +247,12 @@ class _Sweep:
         self.watch.on_progress(f"S of {family.label}, {family.num_parameters} terms")
         started, training = time.perf_counter(), self.triples.take(self.split.training)
         solved = discrete_lagrangian.solve(family, training)
-        told, count = (solved.rank, solved.condition), len(self.triples)
-        about = OfPositions(symmetric, family.num_parameters, *told, count)
-        params = family.unflatten(solved.coefficients)
-        left = discrete_lagrangian.residuals(family, params, training)
+        about = OfPositions(
+            symmetric, family.num_parameters, solved.rank, solved.condition, len(self.triples)
+        )
+        left = discrete_lagrangian.residuals(
+            family, family.unflatten(solved.coefficients), training
+        )
         deviation = np.sqrt(np.mean((left / discrete_lagrangian.displacement(training)) ** 2))
         noise = latent_positions.starting_noise(family, solved.coefficients, training)
         root = deviation * solved.root
@@ -257,13 +275,20 @@ class _Sweep:
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
         left = discrete_lagrangian.residuals(family, params, training) / self.spread
         error = self.error_of(latent_positions.images_of(piece, held), self.split.validation)
-        named = {"label": family.label, "family": family.name, "chart": TYPE1.name}
-        count, took = family.num_parameters, time.perf_counter() - started
-        costs = {"num_parameters": count, "fit_seconds": took}
-        costs |= {"operations": float(sum(family.operations))}
-        told: dict[str, Any] = {"condition": about.condition, "rank": about.rank, **named, **costs}
-        rms = float(np.sqrt(np.mean(left**2)))
-        candidate = Candidate.of(error, train_rms=rms, validated=True, **told)
+        gradient, with_hessian = family.operations
+        candidate = Candidate.of(
+            error,
+            label=family.label,
+            family=family.name,
+            chart=TYPE1.name,
+            num_parameters=family.num_parameters,
+            operations=float(gradient + with_hessian),
+            train_rms=float(np.sqrt(np.mean(left**2))),
+            validated=True,
+            fit_seconds=time.perf_counter() - started,
+            condition=about.condition,
+            rank=about.rank,
+        )
         self.tried.append(candidate)
         self.watch.on_candidate(candidate)
         return _Found(piece, candidate, about, root, noise)
@@ -278,15 +303,18 @@ class _Sweep:
         nothing where there are enough. left_out: lines about readings that were."""
         self.watch.on_progress(f"compiling the step of {best.candidate.label}")
         sensors = dataclasses.replace(self.sensors, sigma=best.noise)
-        of_states = sensors, self.triples, self.sites
-        map_, states = latent_positions.map_of(best.piece, best.root, *of_states)
+        map_, states = latent_positions.map_of(
+            best.piece, best.root, sensors, self.triples, self.sites
+        )
         test = self.split.test if len(self.split.test) else self.split.validation
         steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
-        seconds, most = steps.microseconds_per_step, int(steps.iterations.max())
-        timed = {"newton_iterations_max": most, "microseconds_per_step": seconds}
-        chosen = with_error(best.candidate, self.error_of(images, test))
-        chosen = dataclasses.replace(chosen, chosen=True, **timed)
+        chosen = dataclasses.replace(
+            with_error(best.candidate, self.error_of(images, test)),
+            chosen=True,
+            newton_iterations_max=int(steps.iterations.max()),
+            microseconds_per_step=steps.microseconds_per_step,
+        )
         others = [c for c in self.tried if c is not best.candidate]
         met, messages = self.tolerance.met_by(chosen), list(left_out)
         ended = MET if met else self.budget.ended or "larger S are no more accurate"
@@ -295,14 +323,23 @@ class _Sweep:
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         tested = states.take(test[: min(STATES_MEASURED, block_of(2 * map_.dim))])
         determinant = np.asarray(map_.determinant(tested.z0))
-        known: dict[str, Any] = {"positions": best.about, "num_pairs": best.about.num_triples}
-        known["candidates"] = tuple(sorted([*others, chosen], key=lambda c: c.operations))
-        known |= {"messages": tuple(messages), "ended": ended, "seed": seed}
-        known |= {"pairs": states, "validation_pairs": states.take(self.split.validation)}
-        known |= {"stated_by": f"{len(test):,} triples that {part}", "asked": self.tolerance}
-        known["model_determinant_min"] = float(determinant[np.argmin(np.abs(determinant))])
-        known["compile_seconds"] = steps.compile_seconds
-        return Fit(map_, Choice.of(self.budget, tested, **known))
+        choice = Choice.of(
+            self.budget,
+            tested,
+            candidates=tuple(sorted([*others, chosen], key=lambda c: c.operations)),
+            asked=self.tolerance,
+            num_pairs=best.about.num_triples,
+            messages=tuple(messages),
+            ended=ended,
+            compile_seconds=steps.compile_seconds,
+            model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
+            pairs=states,
+            positions=best.about,
+            stated_by=f"{len(test):,} triples that {part}",
+            validation_pairs=states.take(self.split.validation),
+            seed=seed,
+        )
+        return Fit(map_, choice)
 
 
 def _split(triples: discrete_lagrangian.Triples, seed: int) -> Split:

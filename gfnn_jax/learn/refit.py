@@ -76,8 +76,10 @@ def why_not(map_: SymplecticMap) -> str:
 
 def not_refitted(fitted: Fit, why: str) -> Fit:
     """The fit of a sample as it is, with a warning (FitWarning) that says so, and why."""
-    fitted_to = f"a sample of {fitted.num_pairs} pairs, not to all of them"
-    message = f"{fitted.chosen.label} is fitted to {fitted_to}: {why}"
+    message = (
+        f"{fitted.chosen.label} is fitted to a sample of {fitted.num_pairs} pairs, not to all of "
+        f"them: {why}"
+    )
     warnings.warn(message, FitWarning, stacklevel=2)
     return fitted.replaced(messages=(*fitted.messages, message))
 
@@ -162,18 +164,23 @@ def refit(
         group.broadcast({})
     if chosen is None or not after <= Options.no_worse * before:
         found_map = "no map" if chosen is None else f"a worse map (RMS error {after:.2e})"
-        kept = f"that of the sample (RMS error {before:.2e} in the data's units) is kept"
-        warn(f"the fit to all pairs gives {found_map}: {kept}")
+        warn(
+            f"the fit to all pairs gives {found_map}: that of the sample (RMS error {before:.2e} "
+            "in the data's units) is kept"
+        )
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
         law = _with_coefficients(law, found.law, chosen)
     if not tolerance.met_by(chosen):
         warn(tolerance.missed_by(chosen, fitted.ended))
-    seconds = fitted.seconds + time.perf_counter() - started
-    candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
-    told = {"num_pairs": num_pairs, "hamiltonian": law, "messages": tuple(messages)}
-    new = map_ if chosen is old else better
-    return fitted.replaced(map=new, candidates=candidates, seconds=seconds, **told)
+    return fitted.replaced(
+        map=map_ if chosen is old else better,
+        candidates=tuple(chosen if c.chosen else c for c in fitted.candidates),
+        num_pairs=num_pairs,
+        seconds=fitted.seconds + time.perf_counter() - started,
+        hamiltonian=law,
+        messages=tuple(messages),
+    )
 
 
 def _states_of(parts: Sequence[Pairs]) -> np.ndarray:

@@ -90,9 +90,10 @@ def check_request(
     if pairs.period is not None and options.chart == "type1":
         raise FitError("expected another chart than type1 for a driven map")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
-        reversed_ = (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
-        wanted = "expected a time step that is finite and above 0"
-        raise FitError(f"{wanted}, got {pairs.dt}{reversed_}")
+        raise FitError(
+            f"expected a time step that is finite and above 0, got {pairs.dt}"
+            + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
+        )
     known = () if options.base is None else (options.base,)
     try:
         if anything_told(options.terms):
@@ -109,9 +110,10 @@ def check_request(
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         finite = np.isfinite(np.asarray(z)).all(axis=1)
         if not finite.all():
-            first = f"the first is row {int(np.argmin(finite))}"
-            got = f"{int((~finite).sum())} rows of {name} with NaN or infinity"
-            raise FitError(f"expected finite states, got {got}, {first}")
+            raise FitError(
+                f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
+                f"infinity, the first is row {int(np.argmin(finite))}"
+            )
     if structure is None:
         check_number(pairs)
     elif len(pairs) < FEWEST:
@@ -126,8 +128,10 @@ def _check_told(structure: str | None, options: FitOptions, pairs: Pairs) -> Non
     refused["args or a drive"] = depends
     for what, given in refused.items():
         if given:
-            told = "values, bounds and ties of coefficients are of H of plain pairs"
-            raise FitError(f"terms: {told}, got {what}: give the terms without them")
+            raise FitError(
+                "terms: values, bounds and ties of coefficients are of H of plain pairs, got "
+                f"{what}: give the terms without them"
+            )
     terms = given_terms(pairs.dim, untold(options.terms))
     Constrained.of(terms, told_terms(pairs.dim, options.terms))
 
@@ -173,12 +177,15 @@ def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
     else:
         states = np.asarray(sample_states(scene, OPTIONS.compared, jax.random.key(0)))
     messages = []
-    halves = split(np.asarray(pairs.z0)), split(states)
-    for name, ours, theirs in zip(("positions", "momenta"), *halves, strict=True):
+    for name, ours, theirs in zip(
+        ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
+    ):
         size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
         if usual > 0 and not 1 / OPTIONS.other_size < size / usual < OPTIONS.other_size:
-            told = f"the {name} are {size / usual:.2g} times the size of those in {scene.name}"
-            messages.append(f"{told}, whose features assume its own units: are the data in these?")
+            messages.append(
+                f"the {name} are {size / usual:.2g} times the size of those in {scene.name}, whose "
+                "features assume its own units: are the data in these?"
+            )
     return messages
 
 
@@ -192,9 +199,11 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
         return []
     unit = "of the coordinates' spread" if tolerance.relative else "in the data's units"
     option = "tolerance" if tolerance.relative else "absolute_tolerance"
-    moves = f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the"
-    less = f"Set --{option.replace('_', '-')} to {OPTIONS.coarse * size:.0e} or less"
-    return [f"{moves} tolerance {tolerance.bound:g}. {less}"]
+    return [
+        f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
+        f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} to "
+        f"{OPTIONS.coarse * size:.0e} or less"
+    ]
 
 
 def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
@@ -204,13 +213,13 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
         return []
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
-    messages = []
-    for a in coordinates.angles:
-        told = f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by"
-        told += f" up to {move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert"
-        if range_[a] > 2 * TWO_PI and move[a] > np.pi:
-            messages.append(f"{told} them, or take {a} out of --angles")
-    return messages
+    return [
+        f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up to "
+        f"{move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert them, or take "
+        f"{a} out of --angles"
+        for a in coordinates.angles
+        if range_[a] > 2 * TWO_PI and move[a] > np.pi
+    ]
 
 
 def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
@@ -240,8 +249,10 @@ def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     move = np.abs(np.asarray(pairs.z1) - np.asarray(pairs.z0))
     count, indices = int((move[:, found] > np.pi).any(axis=1).sum()), ",".join(map(str, found))
     named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
-    told = f"jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is wrapped"
-    return [f"{named} of z: {told}; name it: --angles {indices}"]
+    return [
+        f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
+        f"wrapped; name it: --angles {indices}"
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,12 +321,20 @@ def checked(
     found = structure_of(structure, pairs.dim, coordinates)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
-    asked = {name: getattr(options, name) for name in ("learn", "family", "chart", "base")}
-    pairs, learn, messages = as_varied(pairs, structure=structure, **asked)
+    pairs, learn, messages = as_varied(
+        pairs,
+        learn=options.learn,
+        family=options.family,
+        chart=options.chart,
+        base=options.base,
+        structure=structure,
+    )
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= OPTIONS.still:
-        why = "is H = 0, or are these the same columns twice?"
-        raise FitError(f"expected states that move, got z1 = z0 in every pair: {why}")
+        raise FitError(
+            "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
+            "columns twice?"
+        )
     if scene is not None and scene.features is not None and options.family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
     bound = Tolerance.of(options)
@@ -384,9 +403,11 @@ def proposed(data: Dataset) -> list[str]:
     best, left = _best(data)
     if not left < PROPOSALS.explained:
         return []
-    left_over = f"a sample of them leaves relative residuals of {left:.1g} in forces and velocities"
-    told = f"the structure {best} explains these pairs: {left_over}, to second order in dt"
-    return [f"{told}. Fit again with --structure {best}"]
+    return [
+        f"the structure {best} explains these pairs: a sample of them leaves relative residuals of "
+        f"{left:.1g} in forces and velocities, to second order in dt. Fit again with "
+        f"--structure {best}"
+    ]
 
 
 def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request, Dataset]]:
@@ -397,8 +418,10 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
         best, left = _best(data)
         if left < PROPOSALS.tried:
             structure = structure_of(best, data.dim, data.coordinates)
-            told = f"the structure {best} leaves relative residuals of {left:.1g} in forces and"
-            request.watch.on_progress(f"{told} velocities: it is tried first")
+            request.watch.on_progress(
+                f"the structure {best} leaves relative residuals of {left:.1g} in forces and "
+                "velocities: it is tried first"
+            )
             same = Dataset.of(data.pairs, data.coordinates, structure, data.row)
             same = dataclasses.replace(same, split=data.split)
             yield dataclasses.replace(request, structure=structure), same

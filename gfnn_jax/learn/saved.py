@@ -111,8 +111,19 @@ def _portable(found: Choice | LearnedLaw | LearnedArm | None) -> Any:
         return WithoutMap(type(found).__name__, fields | own)
     law = found.hamiltonian
     if law is not None:
-        own = dataclasses.replace(law.candidate, map=None)
-        law = dataclasses.replace(law, candidate=own, covariance=None, kinds=law.which_friction)
+        law = dataclasses.replace(
+            law,
+            candidate=dataclasses.replace(law.candidate, map=None),
+            covariance=None,
+            kinds=law.which_friction,
+        )
         law = law if maps.can_be_saved(law) else None  # a user's functions of z cannot
-    without = dict.fromkeys(("pairs", "validation_pairs", "test_pairs", "scene", "budget"))
-    return dataclasses.replace(found, hamiltonian=law, **without)
+    return dataclasses.replace(
+        found,
+        hamiltonian=law,
+        pairs=None,
+        validation_pairs=None,
+        test_pairs=None,
+        scene=None,
+        budget=None,
+    )

@@ -77,8 +77,15 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     climb.climb(most=_SMALL)
     # H with friction that depends on args is not learned.
     lossy_by_args = diagnosis.damping is not None and data.args is not None
-    asked = {"scene": scene, "terms": options.terms, "partly": request.partly}
-    problem = LawProblem(data, tolerance, budget, on_progress=watch.on_progress, **asked)
+    problem = LawProblem(
+        data,
+        tolerance,
+        budget,
+        scene=scene,
+        terms=options.terms,
+        on_progress=watch.on_progress,
+        partly=request.partly,
+    )
     law = None
     if not lossy_by_args:
         dearest = MAX_COST_RATIO * climb.cheapest  # of a law that is chosen beside the maps
@@ -88,8 +95,9 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
     if wanted and options.family == "auto":
         try:
-            sums = SumOfTerms(diagnosis.data, tolerance, scene, options.chart, *given[1:3])
-            of_terms = sums.beside(law)
+            of_terms = SumOfTerms(
+                diagnosis.data, tolerance, scene, options.chart, budget, watch.on_progress
+            ).beside(law)
             if of_terms is not None and law is not None:  # which misses the tolerance
                 own, others = of_terms.candidate, law.candidate
                 no_better = own.validation_bound >= _BETTER * others.validation_bound
@@ -170,12 +178,19 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
     if data.own_dt is not None and not (data.structure is None and data.args is None):
         return []
     if options.family == "mlp":
-        given = (data, tolerance, charts[0], options.max_iterations, options.seed)
-        given = (*given, request.watch.checkpoints)
+        given = (
+            data,
+            tolerance,
+            charts[0],
+            options.max_iterations,
+            options.seed,
+            request.watch.checkpoints,
+        )
         count = options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
-    kept = request.scene, request.watch.factors
-    return list(sweeps_for(options.family, charts, data, tolerance, *kept))
+    return list(
+        sweeps_for(options.family, charts, data, tolerance, request.scene, request.watch.factors)
+    )
 
 
 class _Better:
@@ -217,10 +232,18 @@ def linear_map(data: Dataset, tolerance: Tolerance) -> Candidate | None:
     errors = [measured_error(data, tolerance, image) for image in images]
     error, piece = min(zip(errors, tried, strict=True), key=lambda found: found[0].relative)
     width = len(data.scale)
-    named = {"label": "linear", "family": "linear", "chart": "affine"}
-    costs = {"num_parameters": width * (width + 3) // 2, "operations": 2.0 * width**2}
-    candidate = Candidate.of(error, train_rms=error.relative, fit_seconds=0.0, **named, **costs)
-    return dataclasses.replace(with_error(candidate, error), map=composed(piece, data))
+    candidate = Candidate.of(
+        error,
+        label="linear",
+        family="linear",
+        chart="affine",
+        num_parameters=width * (width + 3) // 2,
+        operations=2.0 * width**2,
+        train_rms=error.relative,
+        fit_seconds=0.0,
+    )
+    map_ = composed(piece, data)
+    return dataclasses.replace(with_error(candidate, error), map=map_)
 
 
 def _of_quadratic(data: Dataset, y0, y1) -> Affine:

@@ -74,7 +74,26 @@ def make(name: str, dt: float | None = None) -> Scene:
     return dataclasses.replace(scene, dt=dt)
 
 
-__all__ = ["SCENES", "AroundOrbit", "DrawnFrom", "NormalSites", "Scene", "Section"]
-__all__ += ["UniformInEllipse", "driven_pendulum", "driven_pendulum_phase", "fput", "froeschle"]
-__all__ += ["henon_heiles", "henon_heiles_section", "make", "n_body", "names", "pcr3bp"]
-__all__ += ["pendulum_length", "standard_map", "toda", "two_body"]
+__all__ = [
+    "SCENES",
+    "AroundOrbit",
+    "DrawnFrom",
+    "NormalSites",
+    "Scene",
+    "Section",
+    "UniformInEllipse",
+    "driven_pendulum",
+    "driven_pendulum_phase",
+    "fput",
+    "froeschle",
+    "henon_heiles",
+    "henon_heiles_section",
+    "make",
+    "n_body",
+    "names",
+    "pcr3bp",
+    "pendulum_length",
+    "standard_map",
+    "toda",
+    "two_body",
+]

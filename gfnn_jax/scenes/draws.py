@@ -140,8 +140,10 @@ def sample_pairs(
     low, high = dt_range
     stroboscopic = scene.period is not None and not scene.any_phase
     if scene.timeless or stroboscopic or not 0 < low < high < np.inf:
-        wanted = "expected 0 < shortest < longest dt, and a scene with a flow"
-        raise ValueError(f"{wanted}; got dt from {low:g} to {high:g} for the scene {scene.name}")
+        raise ValueError(
+            f"expected 0 < shortest < longest dt, and a scene with a flow; got dt from {low:g} to "
+            f"{high:g} for the scene {scene.name}"
+        )
     z0 = sample_states(scene, num_pairs, key)
     dt = low + (high - low) * _uniform(jax.random.fold_in(key, 1), num_pairs)
     z1 = Reference.of(scene).after(with_params(scene, z0, params, t0), dt)

@@ -194,9 +194,10 @@ class Reference:
             try:
                 _ = None if function is None else jax.eval_shape(function, *given)
             except jax.errors.TracerArrayConversionError:
-                wanted = "written with jax.numpy, which JAX can trace; it uses NumPy's functions"
-                told = f"expected the {name} of the scene {scene.name} {wanted}"
-                raise InputError(told) from None
+                raise InputError(
+                    f"expected the {name} of the scene {scene.name} written with jax.numpy, which "
+                    "JAX can trace; it uses NumPy's functions"
+                ) from None
         parts = scene.flow, scene.step, scene.section, scene.hamiltonian
         dynamics = _Dynamics(*parts, 2 * scene.dim, scene.any_phase)
         return cls(dynamics, scene.dt, None if scene.any_phase else scene.period)

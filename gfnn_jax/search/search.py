@@ -345,9 +345,15 @@ def _calibrated(entry: Entry, ratio: float | None) -> Entry:
     candidate = entry.candidate
     if candidate.validated or ratio is None:
         return entry
-    errors = ("validation_rms", "validation_relative", "validation_bound", "deviations")
-    times = {name: ratio * getattr(candidate, name) for name in errors}
-    return entry._replace(candidate=dataclasses.replace(candidate, **times))
+    return entry._replace(
+        candidate=dataclasses.replace(
+            candidate,
+            validation_rms=ratio * candidate.validation_rms,
+            validation_relative=ratio * candidate.validation_relative,
+            validation_bound=ratio * candidate.validation_bound,
+            deviations=ratio * candidate.deviations,
+        )
+    )
 
 
 def _finalists(entries: list[Entry]) -> list[Entry]:
@@ -368,8 +374,11 @@ def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
         key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms),
     )
     as_good = [e for e in others if _as_good(e, others[0])]
-    ordered = [sorted(those, key=lambda e: e.candidate.operations) for those in (meeting, as_good)]
-    return [*ordered[0], *ordered[1], *(e for e in others if not _as_good(e, others[0]))]
+    return [
+        *sorted(meeting, key=lambda e: e.candidate.operations),
+        *sorted(as_good, key=lambda e: e.candidate.operations),
+        *(e for e in others if not _as_good(e, others[0])),
+    ]
 
 
 def _as_good(entry: Entry, best: Entry) -> bool:
@@ -393,8 +402,9 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
     """(chart, family) of the sweeps whose last two sizes gained nothing worth while."""
     found, of_sweep = set(), {}
     for e in entries:
-        own = (e.candidate.chart, e.candidate.family)
-        of_sweep.setdefault(own, []).append(e.candidate.validation_relative)
+        of_sweep.setdefault((e.candidate.chart, e.candidate.family), []).append(
+            e.candidate.validation_relative
+        )
     for sweep, errors in of_sweep.items():
         if len(errors) > 2 and min(errors[-2:]) > GAINED * min(errors[:-2]):
             found.add(sweep)

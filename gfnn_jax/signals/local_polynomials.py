@@ -63,9 +63,18 @@ def local_fits(times: Runs, columns: np.ndarray, size: int, degree: int) -> Loca
     inverse = np.linalg.inv(r)
     powers = (inverse @ coefficients[..., None])[..., 0]
     gains = np.sqrt(np.sum(inverse**2, axis=2))  # (W, k), of the coefficient of each power
-    bend, of_curvature = 2 * powers[..., 2] / half**2, 2 * gains[:, 2] / half**2
-    found = powers[..., 0], powers[..., 1] / half, bend, residuals, gains[:, 1] / half, of_curvature
-    return LocalFits(rows, centres, run, *found, q)
+    return LocalFits(
+        rows,
+        centres,
+        run,
+        powers[..., 0],
+        powers[..., 1] / half,
+        2 * powers[..., 2] / half**2,
+        residuals,
+        gains[:, 1] / half,
+        2 * gains[:, 2] / half**2,
+        q,
+    )
 
 
 def _windows(times: Runs, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

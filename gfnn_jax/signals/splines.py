@@ -151,8 +151,9 @@ class _Problem:
         B = sparse.block_diag(designs, format="csr")
         D = sparse.block_diag(roughs, format="csr")
         y = np.concatenate(targets)
-        ends = tuple(begins), tuple(counts)
-        return cls(step, _band(B.T @ B), _band(D.T @ D), B.T @ y, B, y, *ends)
+        return cls(
+            step, _band(B.T @ B), _band(D.T @ D), B.T @ y, B, y, tuple(begins), tuple(counts)
+        )
 
     def likeliest(self) -> tuple[float, float]:
         """λ of the largest restricted likelihood, and σ there."""

@@ -53,8 +53,10 @@ def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     dtypes = [leaf.dtype for leaf in jax.tree.leaves(tree) if isinstance(leaf, np.ndarray)]
     wide = [dtype for dtype in dtypes if jax.dtypes.canonicalize_dtype(dtype) != dtype]
     if wide:
-        told = f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first"
-        raise InputError(f'{told} (jax.config.update("jax_enable_x64", True))')
+        raise InputError(
+            f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first "
+            '(jax.config.update("jax_enable_x64", True))'
+        )
     return tree, record["description"]
 
 
@@ -184,8 +186,9 @@ def _orbax():
         return ocp.PyTreeCheckpointer()
     # Else it would wait for all processes of a job, which know nothing of this folder.
     own = jax.process_index()
-    names = {"active_processes": {own}, "barrier_sync_key_prefix": f"process{own}"}
-    alone = ocp.options.MultiprocessingOptions(primary_host=own, **names)
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
     return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
@@ -219,9 +222,13 @@ def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
     array = np.ascontiguousarray(leaf).reshape(np.shape(leaf))  # raises TypeError for a random key
     if array.dtype.kind not in "fiubc":
         raise TypeError(f"{name}: a leaf must hold numbers, got dtype {array.dtype}")
-    about = {"shape": list(array.shape), "dtype": str(array.dtype)}
-    digest = hashlib.sha256(array.tobytes()).hexdigest()
-    return {"name": name, "kind": "numpy", **about, "sha256": digest}, array
+    return {
+        "name": name,
+        "kind": "numpy",
+        "shape": list(array.shape),
+        "dtype": str(array.dtype),
+        "sha256": hashlib.sha256(array.tobytes()).hexdigest(),
+    }, array
 
 
 def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> Any:
@@ -231,8 +238,10 @@ def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> An
     shape, dtype = tuple(entry["shape"]), np.dtype(entry["dtype"])
     array = np.asarray(stored[entry["key"]]) if "key" in entry else np.empty(shape, dtype)
     if array.shape != shape or array.dtype != dtype:
-        wanted, own = f"{dtype} of shape {shape}", f"{array.dtype} of shape {array.shape}"
-        raise Damaged(f"{folder}: {name} should be {wanted}, found {own}")
+        raise Damaged(
+            f"{folder}: {name} should be {dtype} of shape {shape}, found {array.dtype} of shape "
+            f"{array.shape}"
+        )
     if hashlib.sha256(array.tobytes()).hexdigest() != entry["sha256"]:
         raise Damaged(f"{folder}: {name} has changed since it was saved (digest differs)")
     return array

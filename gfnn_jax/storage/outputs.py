@@ -52,8 +52,10 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
             inside = [*path.iterdir(), *path.glob("model/*")] if folder else []
             others = [file for file in inside if not any(map(file.match, _OURS))]
             if others:
-                told = f"holds {others[0].name}, which is no part of a model or a run"
-                raise InputError(f"{path}: {told}; not overwritten")
+                raise InputError(
+                    f"{path}: holds {others[0].name}, which is no part of a model or a run; not "
+                    "overwritten"
+                )
         parent = path.absolute().parent
         while not parent.exists():
             parent = parent.parent
@@ -278,8 +280,10 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
         return
     if not resume:
         if not overwrite:
-            ways = "--resume continues it, --overwrite discards it"
-            raise InputError(f"{folder}: holds an unfinished {what} ({ways})")
+            raise InputError(
+                f"{folder}: holds an unfinished {what} (--resume continues it, --overwrite "
+                "discards it)"
+            )
         return _discard(folder)
     try:
         found = json.loads((folder / JOB).read_text(encoding="utf-8"))
@@ -287,8 +291,10 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
         raise InputError(f"{folder}: {JOB} cannot be read ({error})") from error
     other = [key for key in {**found, **job} if found.get(key) != job.get(key)]
     if other:
-        told = f"belongs to another {what}: {', '.join(other)} differ"
-        raise InputError(f"{folder}: {told} (--overwrite discards it)")
+        raise InputError(
+            f"{folder}: belongs to another {what}: {', '.join(other)} differ (--overwrite discards "
+            "it)"
+        )
 
 
 def _discard(folder: Path) -> None:
