@@ -245,6 +245,37 @@ def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
 
 
 @pytest.mark.slow
+def trapped(field, spring, quartic):
+    """q̈ of a charge in a magnetic field and a trap V = spring r² + quartic r⁴."""
+
+    def acceleration(q, v):
+        return field * np.array([v[1], -v[0]]) - (2 * spring + 4 * quartic * q @ q) * q
+
+    return acceleration
+
+
+def test_a_trap_of_degree_four_in_a_magnetic_field_has_its_law():
+    recording = recorded(trapped(2.2, 0.58, 0.39), [1.0, 0.1, 0.0, 0.6], 30, 900)
+    fit = gfnn.fit(recording)
+    found = {"v1**2": 0.5, "v2**2": 0.5, "v2*x1": 2.2, "x1**2": -0.58, "x2**2": -0.58}
+    found |= {"x1**4": -0.39, "x1**2*x2**2": -0.78, "x2**4": -0.39}
+    within_errors(fit.lagrangian, found)
+
+
+def test_a_round_orbit_leaves_open_which_powers_of_the_distance_hold_it():
+    recording = recorded(trapped(2.7, 1.09, 0.157), [1.0, 0.0, 0.0, 0.6], 30, 900)
+    assert gfnn.fit(recording).verdict != "identified"
+
+
+def test_powers_of_two_lengths_may_be_a_series():
+    def acceleration(q, v):  # Toda's, of two bodies between walls
+        between, walls = np.exp(q[0] - q[1]), np.exp([-q[0], q[1]])
+        return 1.5 * np.array([walls[0] - between, between - walls[1]])
+
+    fit = gfnn.fit(recorded(acceleration, [1.0, -0.6, 0.2, 0.3], 30, 900))
+    assert fit.verdict != "identified"
+
+
 def test_one_energy_does_not_tell_a_mass_from_a_potential_of_many_terms():
     def acceleration(q, v):  # M = 1 + (ax² − 1)², as of a bead on a wire; V = −b (ax³/3 − x + cx²)
         a, b, c = 1.2, 9.81, 0.7

@@ -400,7 +400,8 @@ class _AtStates:
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
-        if self.bends and self.closed(here):
+        failed = failures > 0 and isinstance(self.data.model, Stepping)
+        if (self.bends or failed) and self.closed(here):
             return self._curved(dp, dx, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         decrease = self._decrease(there, share, np.zeros(len(here.x), bool))

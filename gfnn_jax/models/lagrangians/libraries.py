@@ -225,10 +225,10 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 
 def last_of_series(rows: Sequence[Row]) -> Row | None:
-    """The first potential of the highest degree tried, which may be where a series of another shape
-    was cut; None where there is none."""
-    ends = (row for row in rows if not any(row[0]) and sum(row[1]) == HIGHEST)
-    return next(ends, None)
+    """The first potential of the highest degree, where that is one of the two highest tried: a
+    series of another shape may have been cut there. None where there is none."""
+    ends = [row for row in rows if not any(row[0]) and sum(row[1]) >= HIGHEST - 1]
+    return max(ends, key=lambda row: sum(row[1]), default=None)
 
 
 def central(dim: int, exponent: float) -> list[Row]:
@@ -300,8 +300,8 @@ def forces(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 def without_forces(rows: Sequence[Row], axes: Sequence[int]) -> tuple[Row, ...]:
     """The rows without constant forces along these axes, whose zero is where the force is none."""
-    forces = potentials(len(rows[0][0]), axes, 1)
-    return tuple(row for row in rows if row not in forces)
+    constant = potentials(len(rows[0][0]), axes, 1)
+    return tuple(row for row in rows if row not in constant)
 
 
 def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]]:

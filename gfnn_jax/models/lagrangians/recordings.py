@@ -69,7 +69,7 @@ from gfnn_jax.models.lagrangians.in_words import (
 )
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, last_of_series, names_of
+from gfnn_jax.models.lagrangians.libraries import FEW, FRICTIONS, central, last_of_series, names_of
 from gfnn_jax.models.lagrangians.nature import NO_COLUMN, Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
@@ -180,7 +180,7 @@ EARLY = (
     "the motion, as a controller does, and do not drive it: name what drives it (--inputs)"
 )
 SERIES = (
-    "powers up to {}, the highest tried, may be a series of another shape, and hold within the "
+    "powers up to {} may be a series of another shape, and hold within the "
     "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms"
 )
 
@@ -350,7 +350,9 @@ def _with_rivals(
 ) -> LearnedLaw:
     """The law with those that are one exchange of terms away and follow a record as well, and the
     motion that tells them apart as the first to record next."""
-    every = TermSearch.of(fit.problem).every_beside(fit)
+    every, d = TermSearch.of(fit.problem).every_beside(fit), fit.problem.dim
+    if 1 < d <= FEW and not fit.problem.angles:  # about as round an orbit any of them turns
+        every = every.plus([("term", central(d, a)[0]) for a in (-1.0, 1.0, 3.0, 4.0)])
     found = [] if fit.problem.parameters else rivals(fit, every)
     if not found:
         return law

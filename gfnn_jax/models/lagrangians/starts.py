@@ -148,7 +148,10 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add_rubbing(LOADED, [textbook])
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
-    some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
+    fields = libraries.gyroscopic(d, angles, 1)
+    some.add_richer([*first, *fields], 3)
+    if 1 < d <= libraries.FEW and not angles:
+        some.add_richer([*libraries.bodies(d, angles), *fields], 4)
     if not some.followed and (zero := some.far_zeros()).any():
         some.add(textbook, zero)
         some.add(_Library(first, 2), zero)
