@@ -187,3 +187,21 @@ def test_steps_bend_along_a_canyon_and_end_where_no_step_promises_more(tolerance
         np.testing.assert_allclose(fit.p, 1.0, rtol=1e-4)
         found.append(model.evaluations)
     assert found[1] < 0.2 * found[0]
+
+
+class _Stiff(_Bent):
+    """The same, with defects that are said to bend the step beyond what can be followed."""
+
+    def closing(self, p, x):
+        return np.full((len(x), x.shape[1] - 1, 1), np.nan)
+
+
+def test_a_straight_step_is_tried_where_one_that_bends_fails():
+    y, x, found = np.zeros((1, 4, 3)), np.zeros((1, 4, 1)), []
+    y[..., 2] = 1.0
+    for model in (_Canyon(), _Stiff()):
+        fit = Readings(model, y, np.full(3, 0.01)).fit(
+            np.array([-1.2, 1.0]), x, np.array([0.01]), max_iterations=200
+        )
+        found.append(fit.p)
+    np.testing.assert_allclose(found, 1.0, rtol=1e-4)

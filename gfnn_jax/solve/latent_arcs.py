@@ -165,6 +165,7 @@ class Options:
     block_bytes: int = 64 * 2**20  # of the sensitivities of a block of arcs
     determined: float = 1e-6  # least singular value, of columns of norm 1, of a direction that is
     short: float = 0.5  # of the decrease that was promised: below, steps are bent
+    trials: int = 2  # of steps that bend, from one place; the straight ones after these are shorter
     probed: float = 0.1  # of a step, over which its curvature is told
     bent: float = 1.5  # times a step, that its acceleration may be: Transtrum and Sethna's 2 · ¾
 
@@ -392,16 +393,16 @@ class _AtStates:
         return at.gap <= OPTIONS.closed * math.sqrt(self.here.x.size)
 
     def tried(self, damping: float, failures: int) -> Tried:
-        """A step of p and x; each that failed halves the next. Where it fails, each arc halves its
-        own: one that is hard to follow holds back no other."""
+        """A step of p and x, which bends at first; each that failed halves the next. Where
+        it fails, each arc halves its own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
         if self._apart:
             return self._each()
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
-        failed = failures > 0 and isinstance(self.data.model, Stepping)
-        if (self.bends or failed) and self.closed(here):
+        bends = self.bends or (failures > 0 and isinstance(self.data.model, Stepping))
+        if bends and failures < OPTIONS.trials and self.closed(here):
             return self._curved(dp, dx, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         decrease = self._decrease(there, share, np.zeros(len(here.x), bool))
@@ -426,7 +427,7 @@ class _AtStates:
 
     def _curved(self, dp: np.ndarray, dx: np.ndarray, damping: float) -> Tried:
         """The end of a whole step that bends, or of the straight one where it would bend by more
-        than is small; where it fails, damping alone makes the next one shorter."""
+        than is small."""
         here = self.here
         p, x, bending = here.p + dp, here.x + dx, self.data.bending(here, dp, dx)
         rows = _reduced(bending)
