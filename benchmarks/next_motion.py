@@ -223,11 +223,14 @@ PIECES: dict[str, Callable[[bool], Numbers]] = {
 
 
 def judged(cases: list[Numbers]) -> tuple[float, float, list[float]]:
-    """Of cases the error before, that which all ways reach, and the samples that each needs."""
-    errors = [
-        np.exp(np.mean([np.log(np.median(np.atleast_2d(c[way]), axis=0)) for c in cases], axis=0))
-        for way in WAYS
-    ]
+    """Of cases the error before, that which all ways reach, and the samples that each needs. The
+    error of a fit that was refused, null in JSON, is infinite."""
+
+    def of(errors: list[Any]) -> np.ndarray:
+        table = np.atleast_2d(np.array(errors, float))
+        return np.median(np.where(np.isnan(table), np.inf, table), axis=0)
+
+    errors = [np.exp(np.mean([np.log(of(c[way])) for c in cases], axis=0)) for way in WAYS]
     asked = max(float(one.min()) for one in errors)
     before = float(np.exp(np.mean([np.log(c["before"]) for c in cases])))
     return before, asked, [needed(one, asked) for one in errors]
