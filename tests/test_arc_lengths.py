@@ -8,10 +8,12 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import Arcs, arcs_of
-from gfnn_jax.models.lagrangians.fit import ArcProblem, SearchOptions
+from gfnn_jax.models.lagrangians.fit import FOLDS, ArcProblem, SearchOptions
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import fit_given, search, to_longer_arcs
+from gfnn_jax.models.lagrangians.structure import Structure
+from gfnn_jax.models.lagrangians.weak_form import weak_start
 
 GIVEN = given_terms(
     ["w1**2 + w1*w2*cos(q1 - q2) + w2**2 + cos(q1) + cos(q2)", "R: w1**2 + w2**2"],
@@ -90,12 +92,36 @@ def test_arcs_that_no_orbit_follows_are_not_taken(longest, followed):
         def follows(self):
             return self.arcs.t.shape[1] <= longest
 
-        def again(self, arcs):
-            return Fit(self.problem, arcs)
+        def in_arcs(self, length):
+            return Fit(self.problem, arcs_of(self.problem.nodes, length))
 
     problem = samples_of(swung(0.0, runs=1)).problem
     longer = to_longer_arcs(Fit(problem, arcs_of(problem.nodes, 20)), 80)
     assert (longer is not None and longer.arcs.t.shape[1] > 40) == followed
+
+
+def test_what_one_search_after_another_asks_of_a_fit_is_fitted_once(monkeypatch):
+    """Searches in a row from one fit ask for the same terms along held-out arcs, and choices in a
+    row among starts for the same longer arcs."""
+    problem = samples_of(swung(0.0, runs=1, end=3.0)).problem
+    whole = Structure(2, GIVEN.terms, GIVEN.friction or ())
+    structure, known = weak_start(whole, problem, False)
+    fit = problem.fit(structure, known, problem.arcs(1.0), problem.scales.sigma)
+    fits, plain = [], ArcProblem.fit
+
+    def counted(self, *given):
+        fits.append(given)
+        return plain(self, *given)
+
+    monkeypatch.setattr(ArcProblem, "fit", counted)
+    smaller = structure.without({("loss", structure.friction[0])})
+    costs = [(fit.cross_validate(smaller), fit.cross_validate(), fit.costs) for _ in range(2)]
+    assert len(fits) == 2 * FOLDS
+    np.testing.assert_array_equal(costs[0], costs[1])
+    assert not np.array_equal(costs[0][0], costs[0][1])
+    longer = [to_longer_arcs(fit, 2 * fit.arcs.t.shape[1]) for _ in range(2)]
+    assert longer[0] is longer[1] is not None
+    assert len(fits) == 2 * FOLDS + 1
 
 
 @pytest.mark.slow

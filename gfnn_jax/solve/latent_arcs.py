@@ -514,7 +514,7 @@ class _AtStates:
         settled = settled and after.promised <= self.data.tolerance * here.cost
         return after, settled or not np.isfinite(here.cost)
 
-    @property
+    @cached_property
     def promised(self) -> float:
         """Decrease of the cost by a whole step of what is determined, if residuals and defects were
         linear: a short step in a narrow valley lowers it by little."""
@@ -527,7 +527,7 @@ class _AtStates:
     def fitted(self, iterations: int, converged: bool) -> Fitted:
         """The fit that ends here."""
         best, measured = self.best if self.closed(self.best) else self.here, self.data.measured
-        rows, m = _reduced(best), best.x.shape[-1]
+        rows, m = self._rows if best is self.here else _reduced(best), best.x.shape[-1]
         finite = np.isfinite(rows.factor).all()
         return Fitted(
             best.p,

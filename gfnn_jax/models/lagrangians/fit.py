@@ -677,18 +677,40 @@ class LawFit:
         self, structure: Structure | None = None, known: Mapping[Key, float] | None = None
     ) -> np.ndarray:
         """Held-out cost (A,) of each arc, of this structure or another: of three blocks of arcs,
-        each left out of a fit. All in the noise scale of this fit; infinite where a fit fails."""
+        each left out of a fit. All in the noise scale of this fit; infinite where a fit fails. A
+        structure without ``known`` is not fitted again: one search after another asks for it."""
+        structure = structure or self.structure
+        if known is None and structure in self._validated:
+            return self._validated[structure]
         arcs, third = self.in_thirds()
         costs = np.full(len(arcs.home), np.inf)
         for k in range(FOLDS):
             some = self.again(structure, known, arcs.take(third != k), rescale=False)
             costs[third == k] = some.held_out(arcs.take(third == k))
+        if known is None:
+            self._validated[structure] = costs
         return costs
 
     @functools.cached_property
+    def _validated(self) -> dict[Structure, np.ndarray]:
+        """Held-out costs (A,) by structures that started from the coefficients of this fit."""
+        return {}
+
+    @property
     def costs(self) -> np.ndarray:
         """Held-out cost (A,) of each arc."""
         return self.cross_validate()
+
+    def in_arcs(self, length: int) -> LawFit:
+        """The structure fitted from here to arcs of this length (nodes), once for each."""
+        if length not in self._in_arcs:
+            self._in_arcs[length] = self.again(arcs=arcs_of(self.problem.nodes, length))
+        return self._in_arcs[length]
+
+    @functools.cached_property
+    def _in_arcs(self) -> dict[int, LawFit]:
+        """Fits to arcs of other lengths."""
+        return {}
 
     def without_thirds(self) -> list[FoldFit]:
         """The fit without each third of the record, by one Gauss–Newton step from that to all of

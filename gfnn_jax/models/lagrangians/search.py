@@ -202,7 +202,7 @@ def to_longer_arcs(fit: LawFit, length: int) -> LawFit | None:
     arcs = arcs_of(fit.problem.nodes, length)
     if arcs.t.shape == fit.arcs.t.shape:
         return None
-    longer = fit.again(arcs=arcs)
+    longer = fit.in_arcs(length)
     return longer if longer.follows else None
 
 

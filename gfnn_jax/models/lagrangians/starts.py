@@ -423,7 +423,7 @@ class _Starts:
             return taken
         longer = near
         for periods in self.problem.options.periods[1:3]:
-            longer = [fit.again(arcs=fit.problem.arcs(periods)) for fit in longer]
+            longer = [fit.in_arcs(fit.problem.length(periods)) for fit in longer]
         least = min(map(misfit, longer))
         if least > min(OPTIONS.white, OPTIONS.noise * self.least):
             count = len(self.fits)
