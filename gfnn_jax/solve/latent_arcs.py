@@ -165,7 +165,7 @@ class Options:
     block_bytes: int = 64 * 2**20  # of the sensitivities of a block of arcs
     determined: float = 1e-6  # least singular value, of columns of norm 1, of a direction that is
     short: float = 0.5  # of the decrease that was promised: below, steps are bent
-    trials: int = 2  # of steps that bend, from one place; the straight ones after these are shorter
+    trials: int = 4  # of steps that bend, from one place; the straight ones after these are shorter
     probed: float = 0.1  # of a step, over which its curvature is told
     bent: float = 1.5  # times a step, that its acceleration may be: Transtrum and Sethna's 2 · ¾
 
