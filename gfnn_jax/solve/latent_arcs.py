@@ -400,9 +400,14 @@ class _AtStates:
             return self._each()
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
-        dp, dx = _solve(self._rows, here.defects, damping)
         bends = self.bends or (failures > 0 and isinstance(self.data.model, Stepping))
-        if bends and failures < OPTIONS.trials and self.closed(here):
+        bends, straight = bends and self.closed(here), failures - OPTIONS.trials
+        if bends and straight >= 0:
+            share = 0.5 ** (1 + straight)
+            if straight == 0:  # as little damping as where bent steps began
+                damping /= _DAMPING.grown_by**OPTIONS.trials
+        dp, dx = _solve(self._rows, here.defects, damping)
+        if bends and straight < 0:
             return self._curved(dp, dx, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         decrease = self._decrease(there, share, np.zeros(len(here.x), bool))
