@@ -133,10 +133,10 @@ def smooth(
     index = np.clip(at - width // 2, 0, n - width)[:, None] + np.arange(width)
     span = 0.5 * (t[index[:, -1]] - t[index[:, 0]])
     x = (t[index] - t[at, None]) / span[:, None]
-    powers = x[:, :, None] ** np.arange(4.0)
-    transposed = powers.swapaxes(1, 2)
-    inverse = np.linalg.inv(transposed @ powers)
-    c = inverse @ (transposed @ y[index])
+    square = x * x  # products: `**` takes five times as long as all the rest
+    powers = np.stack([np.ones_like(x), x, square, square * x], axis=1)
+    inverse = np.linalg.inv(powers @ powers.swapaxes(1, 2))
+    c = inverse @ (powers @ y[index])
     left_out = (y[at] - c[:, 0]) / (1 - inverse[:, 0, 0])[:, None]
     return Smooth(c[:, 0], c[:, 1] / span[:, None], 2 * c[:, 2] / span[:, None] ** 2), left_out
 
