@@ -140,7 +140,7 @@ S, H, L = "models.generating_functions", "models.hamiltonians", "models.lagrangi
 
 
 class Constant(NamedTuple):
-    """module, name: where it stands; a name with a point is a field of frozen options. cases: that
+    """module, name: where it stands; a name with a point is one of a class of options. cases: that
     it decides in. unit: what it is measured in."""
 
     module: str
@@ -159,18 +159,18 @@ CONSTANTS = tuple(
             "rows ÷ terms of S",
         ),
         ("search.search", "GAINED", ("clean", "noisy"), "error ÷ least before, no gain above"),
-        ("search.search", "OPTIONS.farthest", ("clean", "two"), "orders ÷ range of orders"),
-        ("search.search", "OPTIONS.stalled", ("noisy",), "sizes in a row without a gain"),
-        ("search.search", "OPTIONS.no_worse", ("noisy",), "error ÷ error, as good below"),
-        ("search.search", "OPTIONS.far", ("clean", "few"), "foretold error ÷ tolerance"),
+        ("search.search", "Options.farthest", ("clean", "two"), "orders ÷ range of orders"),
+        ("search.search", "Options.stalled", ("noisy",), "sizes in a row without a gain"),
+        ("search.search", "Options.no_worse", ("noisy",), "error ÷ error, as good below"),
+        ("search.search", "Options.far", ("clean", "few"), "foretold error ÷ tolerance"),
         (
             "learn.choose",
-            "OPTIONS.confirmed",
+            "Options.confirmed",
             ("clean", "long"),
             "bound of own steps ÷ of the search",
         ),
         ("learn.noisy_sweeps", "_NO_WORSE", ("noisy",), "squared error ÷ least, as good below"),
-        ("dataset.split", "OPTIONS.fraction", ("few", "noisy"), "part of the pairs that validates"),
+        ("dataset.split", "Options.fraction", ("few", "noisy"), "part of the pairs that validates"),
         ("diagnosis.local_jacobians", "_FAR", ("long",), "determinant of ∂w/∂z"),
         (
             "diagnosis.local_jacobians",
@@ -178,8 +178,8 @@ CONSTANTS = tuple(
             ("damped", "outliers"),
             "neighbours ÷ unknowns",
         ),
-        ("diagnosis.outliers", "OPTIONS.most_outliers", ("outliers",), "part of the pairs"),
-        ("learn.gross_errors", "OPTIONS.beyond", ("outliers",), "residual ÷ neighbours'"),
+        ("diagnosis.outliers", "Options.most_outliers", ("outliers",), "part of the pairs"),
+        ("learn.gross_errors", "Options.beyond", ("outliers",), "residual ÷ neighbours'"),
         ("fitting.significance", "CERTAIN", ("damped",), "standard errors"),
         ("fitting.significance", "ABOVE_NOISE", ("law", "sequences"), "standard errors"),
         (f"{H}.search", "MAX_COST_RATIO", ("law",), "operations ÷ the map's"),
@@ -207,14 +207,10 @@ def set_to(module: str, name: str, value: Any) -> Iterator[None]:
     owner, _, field = name.partition(".")
     held = getattr(importlib.import_module(f"gfnn_jax.{module}"), owner)
     undo: list[Callable[[], None]] = []
-    if isinstance(held, type):  # a class of options: its default
-        names = [f.name for f in dataclasses.fields(held)]
-        made: Any = held.__init__
-        before = made.__defaults__
-        after = list(before)
-        after[names.index(field) - len(names)] = value
-        made.__defaults__ = tuple(after)
-        undo.append(lambda: setattr(made, "__defaults__", before))
+    if isinstance(held, type):  # a class of options
+        before = getattr(held, field)
+        setattr(held, field, value)
+        undo.append(lambda: setattr(held, field, before))
     elif field:
         alike = {id(o): o for m in _modules() for o in vars(m).values() if type(o) is type(held)}
         for options in alike.values():

@@ -1,7 +1,6 @@
 """Budgets: decisions that count operations, and a clock that only says how many fit."""
 
 import contextlib
-import dataclasses
 import itertools
 import time
 import warnings
@@ -312,8 +311,8 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
 @QUIETLY
 def test_where_the_budget_does_not_pay_for_all_pairs_a_sample_is_fitted(monkeypatch):
     """The seconds and operations of the budget tell, not the clock."""
-    few = dataclasses.replace(of_pairs.OPTIONS, of_pair=10**9, fewest=200)
-    monkeypatch.setattr(of_pairs, "OPTIONS", few)
+    monkeypatch.setattr(of_pairs.Options, "of_pair", 10**9)
+    monkeypatch.setattr(of_pairs.Options, "fewest", 200)
     pairs, work = kepler(300), 300 * 16 * 10**9
     seconds = work / 1e10
     for allowed, tick, num_pairs in ((0.9, 4.0, 200), (0.9, 1e-3, 200), (1.1, 4.0, 300)):

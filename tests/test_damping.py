@@ -1,6 +1,5 @@
 """Maps that lose area: the factor, the map behind it, and what its orbits tend to."""
 
-import dataclasses
 import warnings
 
 import numpy as np
@@ -256,7 +255,7 @@ def test_of_many_pairs_a_sample_tells_whether_areas_are_lost(b, monkeypatch):
         return fitted(self, *given)
 
     monkeypatch.setattr(damping._Problem, "fitted", counted)
-    monkeypatch.setattr(damping, "OPTIONS", dataclasses.replace(damping.OPTIONS, sample=100))
+    monkeypatch.setattr(damping.Options, "sample", 100)
     z = np.random.default_rng(0).uniform(-1, 1, (3_000, 2))
     p = z[:, 1] - 0.4 * np.sin(z[:, 0])
     image = np.stack([z[:, 0] + 0.4 * p, b * p], axis=1)

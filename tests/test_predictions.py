@@ -191,7 +191,7 @@ def test_full_disk(tmp_path, whole, when):
 @pytest.mark.slow
 def test_memory_is_bounded(tmp_path, monkeypatch):
     """An output of 50 MB within a few chunks and the assembly's buffer, also for a single lane."""
-    monkeypatch.setattr(predictions.OPTIONS, "assembly", 2**20)
+    monkeypatch.setattr(predictions.Options, "assembly", 2**20)
     for lanes in (1, 40):
         saved, chunk = 1_600_000 // lanes, 20_000 // lanes
         tracemalloc.start()

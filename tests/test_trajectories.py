@@ -283,7 +283,7 @@ def test_data_of_a_scene_take_one_compilation_per_program(compilations):
 def test_a_state_has_the_same_bits_beside_any_others(name, compilations):
     """Alone, in another order, in blocks that are full or not, and for any number of steps."""
     scene = integrated("two-body") if name == "two-body" else scenes.make(name)
-    num = 2 * tr.OPTIONS.lanes_on_cpu + 1
+    num = 2 * tr.Options.lanes_on_cpu + 1
     z0, t0 = draws.sample_states(scene, num, KEY), draws.sample_t0(scene, num, KEY)
 
     def followed(rows, num_steps=3):
@@ -307,7 +307,7 @@ def test_first_draws_are_those_of_more():
 
 def test_long_trajectories_go_on_from_call_to_call():
     """More states than one call returns, against a plain loop over the map."""
-    scene, num_steps = scenes.standard_map(), 2 * tr.OPTIONS.saved_at_once + 6
+    scene, num_steps = scenes.standard_map(), 2 * tr.Options.saved_at_once + 6
     z0 = draws.sample_states(scene, 3, KEY)
     found = tr.reference_trajectories(scene, z0, num_steps, save_every=2)
     path, step = [z0], jax.jit(jax.vmap(scene.step))

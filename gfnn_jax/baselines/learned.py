@@ -172,7 +172,6 @@ def learn_map(
     return Learned(lambda z: step(params, z), params, label, trained)
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """hidden: layers, theirs. tolerance: local error of a predicted step, as in their experiments
     on two bodies."""
@@ -181,13 +180,12 @@ class _Options:
     tolerance: float = 1e-9
 
 
-_OPTIONS = _Options()
 _ACTIVATION = "tanh"
 
 
 def vfnn(sequences: Sequences, budget: Budget) -> Learned:
     """Learn ż = N(z), N a network with 2d outputs."""
-    field, params = network_field(sequences, _OPTIONS.hidden, budget.key)
+    field, params = network_field(sequences, _Options.hidden, budget.key)
     return _learn_field(field, params, sequences, budget, "vector field 200-200")
 
 
@@ -196,7 +194,7 @@ def hnn(sequences: Sequences, budget: Budget) -> Learned:
     z, velocity = sequences.derivatives()
     target_gradient = -apply_j(velocity)  # ∇H
     inputs = box_inputs(z, angles=q_angles(sequences))
-    family = Mlp(inputs, _OPTIONS.hidden, _ACTIVATION, amplitude_of(z, target_gradient))
+    family = Mlp(inputs, _Options.hidden, _ACTIVATION, amplitude_of(z, target_gradient))
 
     def field(params, z):
         return apply_j(jax.grad(family, argnums=1)(params, z))
@@ -239,7 +237,7 @@ def _learn_field(field, params, sequences: Sequences, budget: Budget, label: str
 
     # Along a solution the angles need not be reduced again: the field is that of the reduced state.
     def step(params, z):
-        return flow_step(lambda y: field(params, y), sequences.dt, _OPTIONS.tolerance)(z)
+        return flow_step(lambda y: field(params, y), sequences.dt, _Options.tolerance)(z)
 
     step = periodic(step, sequences.angles)
     return Learned(lambda z: step(params, z), params, label, trained)

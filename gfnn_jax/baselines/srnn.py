@@ -16,7 +16,6 @@ which serves noisy data. There are two variants for systems that are not separab
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -37,14 +36,10 @@ from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, split
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Hidden layers, theirs."""
 
     hidden: tuple[int, ...] = (256, 256)
-
-
-_OPTIONS = _Options()
 
 
 def _learned(step: Callable, params, sequences: Sequences, budget: Budget, label: str) -> Learned:
@@ -65,7 +60,7 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
         chosen = list(columns)
         return Mlp(
             box_inputs(z, angles=q_angles(sequences), cyclic=others),
-            _OPTIONS.hidden,
+            _Options.hidden,
             "tanh",
             amplitude_of(z[:, chosen], gradient[:, chosen]),
         )
@@ -95,7 +90,7 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
 
 def o_net(sequences: Sequences, budget: Budget) -> Learned:
     """Learn a leapfrog of a network with 2d outputs."""
-    field, params = network_field(sequences, _OPTIONS.hidden, budget.key)
+    field, params = network_field(sequences, _Options.hidden, budget.key)
     step = leapfrog(
         lambda params, z: split(field(params, z))[0],
         lambda params, z: split(field(params, z))[1],

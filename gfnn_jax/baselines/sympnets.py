@@ -17,7 +17,6 @@ is the exact flow. Any linear symplectic map is such a row with quadratic f.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 
@@ -30,7 +29,6 @@ from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, split
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Sizes, of LA as in the paper. deviation: of the first weights. unroll: layers
     compiled in a row; all layers would take four times as long to compile."""
@@ -46,9 +44,6 @@ class _Options:
     p_unroll: int = 6
 
 
-_OPTIONS = _Options()
-
-
 def _recipe(epoch_length: int = 250, rate: float = 1e-3) -> Recipe:
     return Recipe(
         batch_size=200, epochs=1_200, epoch_length=epoch_length, rate=rate, schedule="cosine"
@@ -57,8 +52,8 @@ def _recipe(epoch_length: int = 250, rate: float = 1e-3) -> Recipe:
 
 def la_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     """Learn linear and activation modules in turn, a linear one last."""
-    params = la_init(budget.key, sequences.dim, _OPTIONS.layers, _OPTIONS.sublayers)
-    label = f"{_OPTIONS.layers} layers of {_OPTIONS.sublayers} sublayers"
+    params = la_init(budget.key, sequences.dim, _Options.layers, _Options.sublayers)
+    label = f"{_Options.layers} layers of {_Options.sublayers} sublayers"
     return learn_map(la_step, params, sequences, _recipe(), budget, label)
 
 
@@ -68,9 +63,9 @@ def la_init(key, dim: int, layers: int, sublayers: int):
     linear, active = jax.random.split(key)
     shape = (layers, sublayers, dim, dim)
     return {
-        "half": _OPTIONS.deviation * jax.random.normal(linear, shape, jnp.float32),
+        "half": _Options.deviation * jax.random.normal(linear, shape, jnp.float32),
         "shift": jnp.zeros((layers, 2 * dim), jnp.float32),
-        "active": _OPTIONS.deviation * jax.random.normal(active, (layers - 1, dim), jnp.float32),
+        "active": _Options.deviation * jax.random.normal(active, (layers - 1, dim), jnp.float32),
     }
 
 
@@ -84,7 +79,7 @@ def la_step(params, z):
 
     active = params["active"]
     modules = (matrices[:-1], params["shift"][:-1], active, _even(len(active)))
-    z, _ = jax.lax.scan(layer, z, modules, unroll=_OPTIONS.unroll)
+    z, _ = jax.lax.scan(layer, z, modules, unroll=_Options.unroll)
     return matrices[-1] @ z + params["shift"][-1]
 
 
@@ -115,8 +110,8 @@ def _linear(halves, dim: int):
 
 def g_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     """Learn gradient modules: shears by the gradient of Σᵢ aᵢ F(kᵢ·q + bᵢ), F' the sigmoid."""
-    params = g_init(budget.key, sequences.dim, _OPTIONS.g_layers, _OPTIONS.g_width)
-    label = f"{_OPTIONS.g_layers} layers of width {_OPTIONS.g_width}"
+    params = g_init(budget.key, sequences.dim, _Options.g_layers, _Options.g_width)
+    label = f"{_Options.g_layers} layers of width {_Options.g_width}"
     return learn_map(g_step, params, sequences, _recipe(), budget, label)
 
 
@@ -125,9 +120,9 @@ def g_init(key, dim: int, layers: int, width: int):
     """Draw parameters, float32: inner weights, biases, outer weights of each module."""
     inner, outer = jax.random.split(key)
     return {
-        "inner": _OPTIONS.deviation * jax.random.normal(inner, (layers, width, dim), jnp.float32),
+        "inner": _Options.deviation * jax.random.normal(inner, (layers, width, dim), jnp.float32),
         "bias": jnp.zeros((layers, width), jnp.float32),
-        "outer": _OPTIONS.deviation * jax.random.normal(outer, (layers, width), jnp.float32),
+        "outer": _Options.deviation * jax.random.normal(outer, (layers, width), jnp.float32),
     }
 
 
@@ -144,17 +139,17 @@ def g_step(params, z):
 
     inner = params["inner"]
     modules = (inner, params["bias"], params["outer"], _even(len(inner)))
-    return jax.lax.scan(layer, z, modules, unroll=_OPTIONS.unroll)[0]
+    return jax.lax.scan(layer, z, modules, unroll=_Options.unroll)[0]
 
 
 def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     """Learn ridge polynomials of the degrees 2 to 6."""
     largest = float(np.max(np.sqrt(np.mean(sequences.z**2, axis=(0, 1)))))
-    params = p_init(budget.key, sequences.dim, _OPTIONS.p_layers, _OPTIONS.p_degree)
+    params = p_init(budget.key, sequences.dim, _Options.p_layers, _Options.p_degree)
     # High powers of states much larger than 1 would overflow before the training begins.
     direction = np.asarray(params["direction"])
     params["direction"] = direction / np.float32(max(1.0, largest))
-    label = f"{_OPTIONS.p_layers} ridge polynomials of degree {_OPTIONS.p_degree}"
+    label = f"{_Options.p_layers} ridge polynomials of degree {_Options.p_degree}"
 
     def step(params, z):
         return p_step(params, z, sequences.dt)
@@ -185,4 +180,4 @@ def p_step(params, z, dt: float):
         return z + dt * slope * apply_j(direction), None
 
     layers = (params["direction"], params["coefficient"])
-    return jax.lax.scan(layer, z, layers, unroll=_OPTIONS.p_unroll)[0]
+    return jax.lax.scan(layer, z, layers, unroll=_Options.p_unroll)[0]

@@ -35,15 +35,8 @@ SECONDS |= {"d": 1.0, "year": 1.0}
 
 
 class _Options:
-    """Columns that are told apart by their values.
-
-    Limits, chosen on tops, populations and mechanical systems drawn at random (tests of
-    proposals).
-
-    lags: samples over which changes are taken. quarter: of the columns' variance that a change may
-    have. samples: changes for each function, at least. parts: into which the runs are cut, each
-    judged by the fit to the others. invariant: part of a function's variance within runs,
-    that noise leaves of one that is constant in each."""
+    """Limits of columns that are told apart by their values, chosen on tops, populations and
+    mechanical systems drawn at random (tests of proposals)."""
 
     like: float = 0.85  # likeness of a column to the derivative of another, that tells
     most_columns: int = 12  # whose names do not tell, that are compared
@@ -52,12 +45,12 @@ class _Options:
     # share of the rates' variance that functions of the columns explain of states
     first_order: float = 0.6
     runs_of_a_body: int = 3  # whose energies and |M|² determine the law of a body that turns
-    lags: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
-    quarter: float = 1.5
-    samples: int = 4
-    parts: int = 8
+    lags: tuple[int, ...] = (1, 2, 4, 8, 16, 32)  # samples over which changes are taken
+    quarter: float = 1.5  # of the columns' variance that a change may have
+    samples: int = 4  # changes for each function, at least
+    parts: int = 8  # into which the runs are cut, each judged by the fit to the others
     told_apart: float = 3e-3
-    invariant: float = 0.05
+    invariant: float = 0.05  # of a function's variance within runs, that noise leaves of a constant
     levels: int = 3  # values of a column that only switches
     rows: int = 10  # that a column numbers, at least
     runs: int = 3

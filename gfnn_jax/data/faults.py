@@ -40,36 +40,25 @@ PROPOSED = ("kind", "let go", "caught", "rounded times", "roles")
 
 class _Options:
     """Thresholds of the checks, chosen on recordings of test systems with and without mistakes
-    (`benchmarks/random_recordings.py`, tests of mistakes).
+    (`benchmarks/random_recordings.py`, tests of mistakes)."""
 
-    wide: step of an angle, in rad, that may as well be one the other way round. swing: in rad,
-    beyond which the unit of an angle that swings is doubted. flat: equal extremes in a row that a
-    sensor's limit makes. drift: relative change of the step over a run. derivative: part of a
-    velocity's variance that the position's derivative must explain. better: score by which other
-    pairs of columns must be better than the declared ones. near: relative, to a factor like 180/π
-    or 1000. off: logarithm of a factor that no filter makes. filtered: deviation of a factor from
-    1, and late: steps of lag, that are reported.
-
-    For different systems: most runs, fewest windows of a run; a run moves by another law where the
-    common fit misses its accelerations by ``worse`` times its own residual, and by ``missed`` of
-    their spread. drives: part of what is missed without a column that is missed with it as an
-    input, at most, where it is one."""
-
-    wide: float = 0.75 * np.pi
-    swing: float = 2 * TURN
-    flat: int = 3
-    drift: float = 5e-3
-    derivative: float = 0.8
-    better: float = 0.25
-    near: float = 0.1
-    off: float = 0.2
-    filtered: float = 0.03
-    late: float = 0.4
-    most_runs: int = 40
+    wide: float = 0.75 * np.pi  # rad: step of an angle that may as well be one the other way round
+    swing: float = 2 * TURN  # beyond which the unit of an angle that swings is doubted
+    flat: int = 3  # equal extremes in a row that a sensor's limit makes
+    drift: float = 5e-3  # relative change of the step over a run
+    derivative: float = 0.8  # of a velocity's variance, that the position's derivative explains
+    better: float = 0.25  # score by which other pairs of columns are better than the declared ones
+    near: float = 0.1  # relative, to a factor like 180/π or 1000
+    off: float = 0.2  # logarithm of a factor that no filter makes
+    filtered: float = 0.03  # deviation of a factor from 1 that is reported
+    late: float = 0.4  # steps of lag that are reported
+    most_runs: int = 40  # that are compared as different systems, of so many windows each
     fewest_windows: int = 40
+    # A run moves by another law where the common fit misses its accelerations by so many times its
+    # own residual, and by this part of their spread.
     worse: float = 6.0
     missed: float = 0.04
-    drives: float = 0.9
+    drives: float = 0.9  # of what is missed without a column, that is missed with it as an input
 
 
 @dataclasses.dataclass(frozen=True)

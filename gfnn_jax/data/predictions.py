@@ -29,18 +29,15 @@ from gfnn_jax.processes import Share
 from gfnn_jax.storage import outputs
 
 
-@dataclasses.dataclass
-class _Options:
-    """format: of the file. assembly, copied: bytes in memory while the output is assembled, and
-    while parts are copied. band_parts: beside a state, its std and three quantiles."""
+class Options:
+    """Format of a prediction, and bytes in memory."""
 
     format: int = 2
-    assembly: int = 64 * 2**20
-    copied: int = 16 * 2**20
-    band_parts: int = 4
+    assembly: int = 64 * 2**20  # bytes in memory while the output is assembled
+    copied: int = 16 * 2**20  # while parts are copied
+    band_parts: int = 4  # beside a state: its std and three quantiles
 
 
-OPTIONS = _Options()
 # Axis of the lanes, of the arrays of a file that have one.
 _OF_LANES = ("trajectories", "std", "status", "left_at", "params", "t0", "horizon")
 _AXIS_OF_LANES = {"quantiles": 1} | dict.fromkeys(_OF_LANES, 0)
@@ -81,7 +78,7 @@ class PredictionJob:
         """The request as a file can hold it."""
         job = {
             **self.identity,
-            "format": OPTIONS.format,
+            "format": Options.format,
             "shape": [self.shape[0], len(self.steps), self.shape[1]],
             **({"bands": True} if self.bands else {}),
             "num_steps": self.num_steps,
@@ -129,7 +126,7 @@ class PredictionWriter:
         self.partial = self.out.with_name(self.out.name + ".partial")
         self.steps = asked.steps
         self.lanes, self._state = asked.shape
-        self.width = self._state * (1 + OPTIONS.band_parts if asked.bands else 1)
+        self.width = self._state * (1 + Options.band_parts if asked.bands else 1)
         self.saved = 0
         self.carry: dict[str, np.ndarray] | None = None
         self._chunks: list[dict[str, Any]] = []  # the journal's entries: file, start, stop, sha256
@@ -251,7 +248,7 @@ class PredictionWriter:
         """One part (B, S, 2d) of the chunks (B, c, parts · 2d), a few lanes at a time."""
         columns = slice(part * self._state, (part + 1) * self._state)
         lane = self.total * self.width * 8
-        together = max(1, OPTIONS.assembly // (2 * max(lane, 1)))
+        together = max(1, Options.assembly // (2 * max(lane, 1)))
         for first in range(0, self.lanes, together):
             lanes = min(together, self.lanes - first)
             chunks = (self._read_chunk(entry, first, lanes) for entry in self._chunks)
@@ -408,7 +405,7 @@ def _copy(name: str, archives: Sequence[zipfile.ZipFile], whole: zipfile.ZipFile
             for stream, own in zip(streams, shapes, strict=True):
                 left = int(np.prod(own[axis:])) * dtype.itemsize
                 while left:
-                    read = stream.read(min(left, OPTIONS.copied))
+                    read = stream.read(min(left, Options.copied))
                     if not read:
                         raise OSError(f"{name} of a part is shorter than its header says")
                     member.write(read)

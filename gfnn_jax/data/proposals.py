@@ -19,35 +19,28 @@ from gfnn_jax.data.traits import Accelerations, Traits, accelerations, turning_p
 
 
 class _Options:
-    """Thresholds, chosen on pendulums, springs and orbits drawn at random (tests of proposals).
+    """Thresholds, chosen on pendulums, springs and orbits drawn at random (tests of proposals)."""
 
-    most: points that a circle is fitted to. round: times the noise, up to which distances from a
-    centre are equal. bent: times those, that the points lie off a straight line. even: scatter of
-    the speed round a circle, relative to its mean, below which the motion may be an orbit's. wide:
-    range in rad from which on an angle is no length. turns, straight: part of what a length, or an
-    angle, leaves of the accelerations that the other kind leaves at most (of small motions both
-    leave as much, to 3 %). follows: part of the accelerations' spread that the better kind leaves
-    at most. still: samples at rest before or behind a motion, and times the noise that they
-    scatter. moved: times the noise of a motion. most_ways: of a hand, to and fro. early: part of a
-    record within which it lets go. large: part of the largest swing. swings: at least, of a motion
-    that is caught. uneven: relative scatter of steps that rounding makes."""
-
-    most: int = 2000
-    round: float = 3.0
-    bent: float = 10.0
-    even: float = 0.25
-    wide: float = 3.0
+    most: int = 2000  # points that a circle is fitted to
+    round: float = 3.0  # times the noise, up to which distances from a centre are equal
+    bent: float = 10.0  # times those, that the points lie off a straight line
+    even: float = (
+        0.25  # relative scatter of the speed round a circle, below which it may be orbited
+    )
+    wide: float = 3.0  # rad: range from which on an angle is no length
+    # Part of what a length, or an angle, leaves of the accelerations that the other kind leaves at
+    # most (of small motions both leave as much, to 3 %).
     turns: float = 0.87
     straight: float = 0.6
-    follows: float = 0.08
-    still: int = 5
-    at_rest: float = 5.0
-    moved: float = 30.0
-    most_ways: int = 2
-    early: float = 0.5
-    large: float = 0.3
-    swings: int = 8
-    uneven: float = 0.02
+    follows: float = 0.08  # of the accelerations' spread, that the better kind leaves at most
+    still: int = 5  # samples at rest before or behind a motion
+    at_rest: float = 5.0  # times the noise, that those scatter
+    moved: float = 30.0  # times the noise: of a motion
+    most_ways: int = 2  # of a hand, to and fro
+    early: float = 0.5  # part of a record within which a hand lets go
+    large: float = 0.3  # part of the largest swing
+    swings: int = 8  # at least, of a motion that is caught
+    uneven: float = 0.02  # relative scatter of steps that rounding makes
     most_states: int = 12
 
 

@@ -30,16 +30,13 @@ _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
 
 
 class _Shown:
-    """width: of the screen, in characters. most: columns (twice as many), faults or runs shown.
-    unknown_loss: standard error of a loss per period, above which its absence is not reported.
-    related: part of a column's variance that a derivative must explain. window: samples that tell a
-    polynomial of degree 5 about as well as all of them."""
+    """Sizes of the screen, and what is worth a line."""
 
-    width: int = 110
-    most: int = 12
-    unknown_loss: float = 0.02
-    related: float = 0.8
-    window: int = 12
+    width: int = 110  # characters
+    most: int = 12  # columns (twice as many), faults or runs
+    unknown_loss: float = 0.02  # standard error per period, above which no absence is reported
+    related: float = 0.8  # of a column's variance that a derivative explains
+    window: int = 12  # samples that tell a polynomial of degree 5 about as well as all of them
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,15 +35,13 @@ _OF_RUN = re.compile(
 
 
 class _Options:
-    """block_rows: rows of a recording that are parsed at a time. sniffed: characters of the file's
-    begin that tell its dialect. last_lines: that tell the separator. shown: lines of a refusal.
-    daily: steps in s from which on the times of dates are in days."""
+    """Sizes by which text is read."""
 
-    block_rows: int = 100_000
-    sniffed: int = 1 << 17
-    last_lines: int = 20
-    shown: int = 3
-    daily: float = 43_200.0
+    block_rows: int = 100_000  # of a recording that are parsed at a time
+    sniffed: int = 1 << 17  # characters of the file's begin that tell its dialect
+    last_lines: int = 20  # that tell the separator
+    shown: int = 3  # lines of a refusal
+    daily: float = 43_200.0  # s: steps from which on the times of dates are in days
 
 
 # What begins as dates and times of day do: 2024-05-01, 5/7/2021, 7.5.2021, 09:33:31.

@@ -17,17 +17,14 @@ from gfnn_jax.signals.wrong_values import WrongValues, wrong_at_jumps, wrong_val
 
 
 class _Options:
-    """narrowest: samples of a window. degree: of its polynomial. block: windows fitted or judged
-    together. ridge: of the fits, relative to columns of unit size. ignored: most columns without a
-    role that are looked at. gone: part of the rows; where more lack a position, columns take turns,
-    and all rows count."""
+    """Windows of accelerations, fits of these, and which rows and columns count."""
 
-    narrowest: int = 9
-    degree: int = 5
-    block: int = 8
-    ridge: float = 1e-8
-    ignored: int = 8
-    gone: float = 0.5
+    narrowest: int = 9  # samples of a window
+    degree: int = 5  # of its polynomial
+    block: int = 8  # windows fitted or judged together
+    ridge: float = 1e-8  # of the fits, relative to columns of unit size
+    ignored: int = 8  # columns without a role that are looked at, at most
+    gone: float = 0.5  # of the rows; where more lack a position, columns take turns: all rows count
 
 
 @dataclasses.dataclass(frozen=True)

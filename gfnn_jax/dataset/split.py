@@ -8,7 +8,6 @@ kindly.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.phase_space import Pairs, sizes
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the split (benchmarks/stated_errors.py)."""
 
@@ -32,13 +30,10 @@ class Options:
     outside: float = 0.05  # of the training pairs, by which errors outside the data are measured
 
 
-OPTIONS = Options()
-
-
 def enough_to_state() -> int:
     """Pairs of runs, of which three stretches or more are held out to state an error: fewer have no
     scatter that bounds it."""
-    return int(3 * OPTIONS.fewest / OPTIONS.fraction)
+    return int(3 * Options.fewest / Options.fraction)
 
 
 class Split(NamedTuple):
@@ -66,15 +61,15 @@ def split_rows(pairs: Pairs, seed: int) -> Split:
     held out is cut into blocks of time first, between which a correlation time is left out.
     """
     rng, count = np.random.default_rng(seed), len(pairs)
-    target = max(OPTIONS.fewest, int(OPTIONS.fraction * count))
-    tested = count >= OPTIONS.fewest_split
+    target = max(Options.fewest, int(Options.fraction * count))
+    tested = count >= Options.fewest_split
     goes_on = steps_between(pairs) > 0  # from each row to the next
     # Single pairs are stretches of their own.
     if not goes_on.any():
-        order, target = rng.permutation(count), min(target, OPTIONS.most)
+        order, target = rng.permutation(count), min(target, Options.most)
         ends = target, (1 + tested) * target
         return Split(order[ends[1] :], order[: ends[0]], order[ends[0] : ends[1]], np.arange(count))
-    block = _blocks(goes_on, target, max(OPTIONS.fewest, target // OPTIONS.parts))
+    block = _blocks(goes_on, target, max(Options.fewest, target // Options.parts))
     lengths = np.bincount(block)
     order = rng.permutation(len(lengths))
     # Blocks in random order until there are rows enough: the last one may bring more.
@@ -85,8 +80,8 @@ def split_rows(pairs: Pairs, seed: int) -> Split:
     gap = correlation_time(pairs, goes_on)
     apart = _apart(goes_on, part, gap)
     kept = [rng.permutation(np.flatnonzero(apart & (part == p))) for p in range(3)]
-    stretch = _blocks(goes_on, 0, max(OPTIONS.fewest, 2 * gap))
-    return Split(kept[0], kept[1][: OPTIONS.most], kept[2][: OPTIONS.most], stretch)
+    stretch = _blocks(goes_on, 0, max(Options.fewest, 2 * gap))
+    return Split(kept[0], kept[1][: Options.most], kept[2][: Options.most], stretch)
 
 
 def _apart(goes_on: np.ndarray, part: np.ndarray, gap: int) -> np.ndarray:
@@ -112,7 +107,7 @@ def correlation_time(pairs: Pairs, goes_on: np.ndarray) -> int:
     """
     z = np.asarray(pairs.z0, np.float64)
     x = (z - z.mean(axis=0)) / sizes(z)
-    most = max(1, int(OPTIONS.fraction * len(x)) // OPTIONS.parts**2)
+    most = max(1, int(Options.fraction * len(x)) // Options.parts**2)
     together = np.ones(len(x), bool)
     for step in range(1, most):
         together = together[:-1] & goes_on[step - 1 :]
@@ -131,7 +126,7 @@ def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:
     centred = counted - counted.mean(axis=0)
     inverse = np.linalg.pinv(centred.T @ centred, rcond=1e-12, hermitian=True)
     distance = np.sum((centred @ inverse) * centred, axis=1)
-    return distance > np.quantile(distance, 1 - OPTIONS.outside)
+    return distance > np.quantile(distance, 1 - Options.outside)
 
 
 def _blocks(goes_on: np.ndarray, longest: int, part: int) -> np.ndarray:

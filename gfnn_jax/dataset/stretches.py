@@ -31,7 +31,6 @@ PER_PERIOD = 40  # nodes
 MOST_STEPS = 6_000  # of a fit: more tell little more
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of stretches, nodes and arcs (benchmarks/random_recordings.py)."""
 
@@ -51,9 +50,6 @@ class Options:
     apart: float = 0.7  # of the time between nodes, after which a channel is looked at again
     empty: float = 100.0  # median steps: no spline leads over a longer one
     exact: float = 1e-6  # of a channel's spread: noise that weighs a reading at the least
-
-
-OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,7 +96,7 @@ class Stretch:
         """Samples (m,) at which a channel is read that was not for about ``spacing``."""
         seen, last, kept = np.isfinite(self.y), np.full(self.y.shape[1], -np.inf), []
         for k, (t, own) in enumerate(zip(self.t.tolist(), seen, strict=True)):
-            if np.any(own & (t - last >= OPTIONS.apart * spacing)):
+            if np.any(own & (t - last >= Options.apart * spacing)):
                 last[own] = t
                 kept.append(k)
         return np.array(kept, int)
@@ -226,7 +222,7 @@ class Scales:
     def substeps(self) -> int:
         """Runge–Kutta steps between two nodes that a search begins with."""
         longest = self.spacing if self.uneven else max(self._spacings)
-        return max(1, int(np.ceil(2 * np.pi / (self.period / longest) / OPTIONS.step)))
+        return max(1, int(np.ceil(2 * np.pi / (self.period / longest) / Options.step)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -283,10 +279,10 @@ def stretches(
                 told = np.isfinite(q[:, i])
                 q[told, i] = np.unwrap(q[told, i])
         whole.append(Stretch(run, t, y, u, q, noise, args_of(recording, run, parameters)))
-    even = [part for s in whole for part in s.complete().cut() if len(part.t) >= OPTIONS.shortest]
-    if even and not between and _readings(even) >= OPTIONS.even * _readings(whole):
+    even = [part for s in whole for part in s.complete().cut() if len(part.t) >= Options.shortest]
+    if even and not between and _readings(even) >= Options.even * _readings(whole):
         return even
-    gap = GAP if recording.inputs else OPTIONS.empty
+    gap = GAP if recording.inputs else Options.empty
     found = [dataclasses.replace(part, even=False) for s in whole for part in s.cut(gap)]
     found = [s for s in found if np.all(np.isfinite(s.q).sum(0) >= FEWEST)]
     if not found:
@@ -314,7 +310,7 @@ def by_rates(
             both = np.isfinite(s.y[:, channels]).all(1)
             y, own = s.y[both][:, channels], (sigma * s.noise[both])[:, channels]
             if both.sum() >= FEWEST:
-                q[both, i] = with_rates(s.t[both], y, own + OPTIONS.exact * np.std(y, axis=0))
+                q[both, i] = with_rates(s.t[both], y, own + Options.exact * np.std(y, axis=0))
         joined.append(dataclasses.replace(s, q=q))
     return joined
 
@@ -342,7 +338,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
         raise InputError(f"position {still} does not move: leave it out of --positions")
     if not all(np.array_equal(s.y, s.q, equal_nan=True) for s in found):
         sigma = _noise_of_channels(found)
-    if isinstance(half, Splines) and np.median([len(s.t) for s in found]) < 2 * OPTIONS.shortest:
+    if isinstance(half, Splines) and np.median([len(s.t) for s in found]) < 2 * Options.shortest:
         others = [np.concatenate([s.u, np.tile(s.args, (len(s.t), 1))], axis=1) for s in found]
         told = noise_of_one_law([(s.t, s.y, o) for s, o in zip(found, others, strict=True)])
         sigma = sigma if told is None else told
@@ -359,7 +355,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
     for own in systems.values():
         parts = (np.concatenate([getattr(s, name) for s in own]) for name in "va")
         v, a = (np.sqrt(np.mean(part**2, axis=0)) for part in parts)
-        omega = max(omega, float(np.max(a / np.maximum(v, OPTIONS.slow * speed))))
+        omega = max(omega, float(np.max(a / np.maximum(v, Options.slow * speed))))
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     stride = np.divide(size, spread, out=np.full(len(size), omega * steps[0]), where=spread > 0)
     longest = max(float(np.ptp(s.t)) for s in found)
@@ -373,12 +369,12 @@ def _windows(
     local cubics for each, and σ (d,), by those of which there are enough."""
     known = sorted(known, key=lambda one: np.median(np.diff(one[0])))
     each = np.array([np.median(np.diff(t)) for t, _ in known])
-    edges = [0, *(np.flatnonzero(each[1:] > OPTIONS.alike * each[:-1]) + 1).tolist(), len(known)]
+    edges = [0, *(np.flatnonzero(each[1:] > Options.alike * each[:-1]) + 1).tolist(), len(known)]
     kinds = [known[a:b] for a, b in pairwise(edges)]
     steps = tuple(float(np.median(np.concatenate([np.diff(t) for t, _ in one]))) for one in kinds)
     windows, noise = zip(*(choose_half(one) for one in kinds), strict=True)
     counts = np.array([sum(len(t) for t, _ in one) for one in kinds])
-    enough = counts >= min(OPTIONS.enough, counts.max())
+    enough = counts >= min(Options.enough, counts.max())
     return steps, windows, np.min(np.array(noise)[enough], axis=0)
 
 
@@ -392,9 +388,9 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
         if not any(y.any() for _, y in known):  # of events
             sigma.append(0.0)
         elif all(s.even for s in found):
-            known = [pair for pair in known if len(pair[0]) >= OPTIONS.shortest]
+            known = [pair for pair in known if len(pair[0]) >= Options.shortest]
             if not known:
-                raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
+                raise FitError(f"a column has no {Options.shortest} samples in a row: leave it out")
             sigma.append(float(_windows(known)[2][0]))
         else:
             sigma.append(float(splines(known).sigma[0]))
@@ -408,14 +404,14 @@ def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
     else:
         parts = [(s, np.arange(0, len(s.t), scales.every(scales.of(s)[0])), None) for s in found]
     total = sum(len(at) for _, at, _ in parts)
-    length = round(OPTIONS.block * scales.per_period)
+    length = round(Options.block * scales.per_period)
     keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
     nodes, count = [], 0
     for s, at, states in parts:
         blocks = [at] if keep == 1 else [at[k : k + length] for k in range(0, len(at), length)]
         for block in blocks:
             count += 1
-            if len(block) < OPTIONS.shortest_arc or (count - 1) % keep:
+            if len(block) < Options.shortest_arc or (count - 1) % keep:
                 continue
             x = scales.cubics(s, block) if states is None else states[block]
             nodes.append(Nodes(s, block, s.t[block], s.y[block], x, np.zeros(s.y.shape[1])))
@@ -430,7 +426,7 @@ def _between_gaps(
     filled = s.rows(s.thinned(scales.spacing)).filled(1.5 * scales.spacing)
     q, v, _ = curves.smooth(s.t, s.q, filled.t)
     seen = np.flatnonzero(np.isfinite(filled.y).any(1))
-    longest = max(OPTIONS.gap * scales.period, 2 * scales.spacing)
+    longest = max(Options.gap * scales.period, 2 * scales.spacing)
     usual, events = float(np.median(np.diff(filled.t[seen]))), not np.nan_to_num(filled.y).any()
     longest = np.inf if events or usual > longest else longest
     ends = np.flatnonzero(np.diff(filled.t[seen]) > longest) + 1
@@ -444,7 +440,7 @@ def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
     for i, node in enumerate(nodes):
         count = max(1, round(len(node.t) / length))
         edges = np.linspace(0, len(node.t), count + 1).round().astype(int)
-        home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= OPTIONS.shortest_arc]
+        home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= Options.shortest_arc]
     longest = max(b - a for _, a, b in home)
     t, y, x, noise = [], [], [], []
     for i, a, b in home:
@@ -503,7 +499,7 @@ def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
     for stretch in found:
         window = max(9, round(scales.period / scales.of(stretch)[0]))
         at_rest = _still(stretch, scales.sigma, window) | _creeps(stretch, scales.sigma, window)
-        at_rest = _shrunk(at_rest, round(OPTIONS.kept * window))
+        at_rest = _shrunk(at_rest, round(Options.kept * window))
         resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
         for a, b in _runs(~at_rest):
             if b - a >= min(window, len(at_rest)):
@@ -519,7 +515,7 @@ def _still(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     if count < 1:
         return np.zeros(len(q), bool)
     views = np.lib.stride_tricks.sliding_window_view(q, window, axis=0)
-    quiet = (views.std(axis=-1) <= OPTIONS.still * sigma[: q.shape[1]]).all(axis=1)
+    quiet = (views.std(axis=-1) <= Options.still * sigma[: q.shape[1]]).all(axis=1)
     begun = np.concatenate([np.cumsum(quiet), np.full(window - 1, np.sum(quiet))])
     ended = np.concatenate([np.zeros(window, int), np.cumsum(quiet)[:-1]])[: len(q)]
     return begun > ended
@@ -536,7 +532,7 @@ def _creeps(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     change = np.diff(views.reshape(*views.shape[:2], 4, part).mean(axis=-1), axis=-1)
     noise = 5 * sigma[: q.shape[1], None] * np.sqrt(2 / part)
     one_way = (change > -noise).all(axis=-1) | (change < noise).all(axis=-1)
-    little = views.std(axis=-1) < OPTIONS.creeping * np.std(q, axis=0)
+    little = views.std(axis=-1) < Options.creeping * np.std(q, axis=0)
     moves = np.flatnonzero(~(one_way & little).all(axis=1))
     begins = moves[-1] + 1 if len(moves) else 0
     return (np.arange(len(q)) >= begins) & (begins < len(views))

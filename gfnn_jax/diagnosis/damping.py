@@ -46,7 +46,6 @@ from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
 from gfnn_jax.phase_space import split, symplectic_form
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the search for a loss of area (benchmarks/damped_maps.py)."""
 
@@ -74,9 +73,6 @@ class Options:
     fewer: float = 1.1  # of the held-out residual: what fewer functions of the args may leave
     explained: float = 0.3  # of the factors' variance, by one coordinate that is named
     errors: float = 3.0  # of the Jacobians, above which what D_b leaves of their defect is real
-
-
-OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +157,7 @@ def learn_damping(
     error: float,
     chart: str,
     reversor,
-    most: float = OPTIONS.most_operations,
+    most: float = Options.most_operations,
 ) -> LearnedDamping | None:
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
@@ -173,10 +169,10 @@ def learn_damping(
     deviation = 1.5 * float(np.median(np.abs(factors - b))) / np.sqrt(len(factors))
     if not b > 0 or not abs(b - 1) > max(3 * error, CERTAIN * deviation):
         return None
-    if len(data.training) > OPTIONS.plenty * OPTIONS.sample:
+    if len(data.training) > Options.plenty * Options.sample:
         parts = (data.training, data.validation)
-        some = data.take(np.concatenate([part[: OPTIONS.sample] for part in parts]))
-        if learn_damping(some, jacobians, error, chart, reversor, OPTIONS.of_sample) is None:
+        some = data.take(np.concatenate([part[: Options.sample] for part in parts]))
+        if learn_damping(some, jacobians, error, chart, reversor, Options.of_sample) is None:
             return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
     undamped = data.without(None, start.piece)
@@ -194,13 +190,13 @@ def learn_damping(
     found, problem = best(np.ones((1, dim)))
     if dim > 1:
         own, its = best(np.eye(dim))
-        if own.held_out < OPTIONS.gain * found.held_out:
+        if own.held_out < Options.gain * found.held_out:
             found, problem = own, its
     if found.family is None or not problem.is_certain(found):
         return None
     none = np.zeros((0, dim))
     kept = problem.fitted(found.family, found.functions, none, np.zeros((1, 0)))  # areas are
-    if not found.held_out < OPTIONS.gain * kept.held_out:
+    if not found.held_out < Options.gain * kept.held_out:
         return None
     found = problem.with_fewer_functions(found)
     return problem.as_learned(found)
@@ -212,7 +208,7 @@ def where_areas_differ(centres, scale, parameters: tuple[str, ...], jacobians) -
     centres: (n, 2d + k), the states at which the Jacobians are, and the ``parameters`` there.
     """
     factors = area_factors(jacobians, scale)
-    explained, sentence = OPTIONS.explained, ""
+    explained, sentence = Options.explained, ""
     names = (*coordinate_names(len(scale) // 2), *parameters)
     for name, x in zip(names, np.asarray(centres).T, strict=True):
         fitted = np.polyval(np.polyfit(x - x.mean(), factors, 2), x - x.mean())
@@ -259,9 +255,9 @@ class _Problem:
         best, worse = _Fitted(factor, unknown, self._drift(np.zeros((1, 0))), np.inf, spread), 0
         for family in self._families(spread, factor):
             found = self.fitted(family, self._functions(family.degree), spread, best.factor)
-            worse = 0 if found.held_out < OPTIONS.better * best.held_out else worse + 1
+            worse = 0 if found.held_out < Options.better * best.held_out else worse + 1
             best = found if worse == 0 else best
-            if worse == OPTIONS.worse or best.held_out < OPTIONS.roundoff:
+            if worse == Options.worse or best.held_out < Options.roundoff:
                 break
         return best
 
@@ -271,7 +267,7 @@ class _Problem:
             return found
         assert found.family is not None
         best, degree, enough = found, 0, found.family.degree
-        as_little = max(OPTIONS.fewer * found.held_out, OPTIONS.at_roundoff)
+        as_little = max(Options.fewer * found.held_out, Options.at_roundoff)
         while degree < enough:
             middle = (degree + enough) // 2
             functions = self._functions(middle)
@@ -316,10 +312,10 @@ class _Problem:
         w = rows_of(undamped, self.chart, rows)[0][0]
         angles, args = tuple(self._angles), undamped.given(rows)[1]
         inputs = box_inputs(w, angles=angles, cyclic=undamped.coordinates.cyclic, args=args)
-        for degree in OPTIONS.degrees:
+        for degree in Options.degrees:
             family = Products(inputs, degree)
             terms = family.num_parameters
-            if degree > OPTIONS.degrees[0] and (
+            if degree > Options.degrees[0] and (
                 ROWS_PER_TERM * terms > w.size or w.size * terms**2 > self.most_operations
             ):
                 return
@@ -338,7 +334,7 @@ class _Problem:
         known = factor[:t]
         factor = np.concatenate([known, np.zeros((t - len(known), k))])
         shift, unknown = np.zeros((t, a)), np.full((t * k, 0), np.inf)
-        for _ in range(OPTIONS.updates):
+        for _ in range(Options.updates):
             b, c = _momenta(spread, values @ factor), self._drift(values @ shift)
             if not (b > 0).all():
                 return _Fitted(factor, unknown, self._drift(shift), np.inf, spread)
@@ -357,7 +353,7 @@ class _Problem:
             inverse = np.linalg.pinv(own[:-1, :-1])
             deviation = abs(own[-1, -1]) / np.sqrt(max(1, len(rows) - len(triangle) + 1))
             change, root = inverse @ own[:-1, -1], deviation * inverse
-            least = np.maximum(OPTIONS.close * np.linalg.norm(root, axis=1), OPTIONS.changed)
+            least = np.maximum(Options.close * np.linalg.norm(root, axis=1), Options.changed)
             if not (np.abs(change) > least).any():
                 break
             factor = factor + change[: t * k].reshape(t, k)
@@ -469,7 +465,7 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
     differing = partial(where_areas_differ, places, plain.scale, plain.parameters)
     if damping is not None:
         undone = damping.undone(jacobians)
-        if data_defect(undone, plain.scale) > OPTIONS.errors * error:
+        if data_defect(undone, plain.scale) > Options.errors * error:
             where = differing(jacobians) or " No coordinate tells where by itself"
             damping = dataclasses.replace(damping, differs=where)
         jacobians, plain = undone, plain.without(None, damping.piece)

@@ -17,7 +17,6 @@ nothing is said.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -34,7 +33,6 @@ from gfnn_jax.diagnosis import local_jacobians
 from gfnn_jax.solve.noise import Biweight, robust
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the screens (benchmarks/hard_cases.py, benchmarks/constants.py)."""
 
@@ -86,9 +84,6 @@ class Options:
     spanned: float = 1e-12  # of the largest: a smaller eigenvalue of a Gram matrix is roundoff
 
 
-OPTIONS = Options()
-
-
 def clean(
     found: Identified,
     coordinates: Coordinates,
@@ -114,7 +109,7 @@ def clean(
         return data, messages
     everyone, count = data, len(data)
     found_outliers = outliers(data.y0, data.y1, data.scale, given_by(data))
-    few = len(found_outliers) <= OPTIONS.most_outliers * count
+    few = len(found_outliers) <= Options.most_outliers * count
     wrong = np.zeros(count, bool)
     wrong[found_outliers[: len(found_outliers) if few else 0]] = True
     gross = gross_errors(data, steps_between(pairs) == 1, wrong)
@@ -124,7 +119,7 @@ def clean(
         data = everyone.lifted_anew(kept)  # the interval of an angle is that of what is left
         if not few:
             found_outliers = kept[outliers(data.y0, data.y1, data.scale, given_by(data))]
-            few = len(found_outliers) <= OPTIONS.most_outliers * count
+            few = len(found_outliers) <= Options.most_outliers * count
             kept = np.setdiff1d(kept, found_outliers) if few else kept
             data = everyone.lifted_anew(kept)
     elif len(kept) < count:
@@ -157,7 +152,7 @@ def around(data: Dataset, unit: np.ndarray, size: np.ndarray, rows, but: int) ->
     rows, of the state or of the image: a state that is a gross error has none but its like."""
     found = np.full(len(rows), np.inf)
     for y in (data.y0 / unit, data.y1 / unit):
-        near = cKDTree(y).query(y[rows], k=OPTIONS.neighbours + 1)[1][:, 1:]
+        near = cKDTree(y).query(y[rows], k=Options.neighbours + 1)[1][:, 1:]
         found = np.minimum(found, np.sort(size[near], axis=1)[:, -1 - but])
     return found
 
@@ -174,9 +169,9 @@ def outliers(y0, y1, scale, given=None) -> np.ndarray:
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     x = x if given is None else np.concatenate([x, given], axis=1)
     rows, found = looked_for_errors(len(x)), []
-    few = OPTIONS.neighbourhoods * local_jacobians.NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
-    for _ in range(OPTIONS.outlier_rounds):
-        outlying = _studentised(x[rows], move[rows]) > OPTIONS.outlying * max(1.0, few)
+    few = Options.neighbourhoods * local_jacobians.NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
+    for _ in range(Options.outlier_rounds):
+        outlying = _studentised(x[rows], move[rows]) > Options.outlying * max(1.0, few)
         if not outlying.any():
             break
         found.append(rows[outlying])
@@ -213,9 +208,9 @@ def _studentised(x, move):
 
 def looked_for_errors(count: int) -> np.ndarray:
     """Rows of so many pairs that are looked at for gross errors: all, or blocks of every part."""
-    blocks = -(-count // OPTIONS.block)
-    apart = -(-blocks // (OPTIONS.most_looked_at // OPTIONS.block))
-    return np.flatnonzero(np.arange(count) // OPTIONS.block % apart == 0)
+    blocks = -(-count // Options.block)
+    apart = -(-blocks // (Options.most_looked_at // Options.block))
+    return np.flatnonzero(np.arange(count) // Options.block % apart == 0)
 
 
 def _suspect(x, move) -> np.ndarray:
@@ -224,8 +219,8 @@ def _suspect(x, move) -> np.ndarray:
     design = np.column_stack([np.ones(len(x)), x])
     rest = move - design @ np.linalg.lstsq(design, move, rcond=None)[0]
     size = np.linalg.norm(rest, axis=1)
-    far = size > OPTIONS.suspect * np.median(size)
-    far[: OPTIONS.usual] = True
+    far = size > Options.suspect * np.median(size)
+    far[: Options.usual] = True
     return np.flatnonzero(far)
 
 
@@ -247,22 +242,22 @@ def gross_errors(data: Dataset, goes_on: np.ndarray, left_out: np.ndarray) -> np
         return rows[gross_errors(data.take(rows), within, left_out[rows])]
     best = None
     for model in _models(data, ~left_out):
-        if best is not None and not model.left < OPTIONS.gained * best.left:
+        if best is not None and not model.left < Options.gained * best.left:
             continue
         best = model
-    if best is None or not best.left < OPTIONS.usable:
+    if best is None or not best.left < Options.usable:
         return none
     size = np.where(left_out, np.inf, best.sizes)
-    far = np.flatnonzero((size > OPTIONS.beyond) & ~left_out)
-    between = np.sum((size > OPTIONS.ordinary) & (size <= OPTIONS.beyond))
+    far = np.flatnonzero((size > Options.beyond) & ~left_out)
+    between = np.sum((size > Options.ordinary) & (size <= Options.beyond))
     # Those that neighbours told before are gross errors too: beside them there may be few.
-    few = not len(far) or len(far) + left_out.sum() < OPTIONS.fewest_errors
-    if few or len(far) > OPTIONS.most_errors * len(size) or between > OPTIONS.between * len(far):
+    few = not len(far) or len(far) + left_out.sum() < Options.fewest_errors
+    if few or len(far) > Options.most_errors * len(size) or between > Options.between * len(far):
         return none
     if goes_on.any():
         return _borne_out(best, far, goes_on, left_out)
-    alone = far[around(data, best.unit, size, far, OPTIONS.but) < OPTIONS.ordinary]
-    return alone if len(alone) >= OPTIONS.alone * len(far) else none
+    alone = far[around(data, best.unit, size, far, Options.but) < Options.ordinary]
+    return alone if len(alone) >= Options.alone * len(far) else none
 
 
 class _Model:
@@ -300,8 +295,8 @@ class _Model:
         """((coefficients, median residual), every row's residual in units of it, the median)."""
         inside = self._within(y)
         rows = np.flatnonzero(inside & known)
-        if len(rows) > OPTIONS.most_rows:
-            rows = np.sort(np.random.default_rng(0).choice(rows, OPTIONS.most_rows, replace=False))
+        if len(rows) > Options.most_rows:
+            rows = np.sort(np.random.default_rng(0).choice(rows, Options.most_rows, replace=False))
         design = self._design(y)
         coefficients, median = _resistant(design[rows], move[rows])
         size = np.linalg.norm(move - design @ coefficients, axis=1)
@@ -309,13 +304,13 @@ class _Model:
         return (coefficients, median), np.where(inside, in_units, 0.0), median
 
     def _within(self, y):
-        far = np.abs(y - self._centre) > OPTIONS.within * self.unit
+        far = np.abs(y - self._centre) > Options.within * self.unit
         far[:, [*self._angles, *self._free]] = False
         return ~far.any(axis=1)
 
     def _design(self, y):
         """Monomials (N, m) of the coordinates, of an angle's cosine and sine."""
-        x = (y - self._centre) / (OPTIONS.within / 2 * self.unit)
+        x = (y - self._centre) / (Options.within / 2 * self.unit)
         columns = []
         for i in range(y.shape[1]):
             if i in self._angles:
@@ -329,7 +324,7 @@ def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
     """Models by rising degree, as far as the pairs tell their terms."""
     coordinates, width = data.coordinates, data.y0.shape[1]
     width += len(coordinates.angles) - len(set(coordinates.cyclic) - set(coordinates.angles))
-    most = min(OPTIONS.most_terms, int(known.sum()) // OPTIONS.pairs_per_monomial)
+    most = min(Options.most_terms, int(known.sum()) // Options.pairs_per_monomial)
     degree = 1
     while math.comb(width + degree, degree) <= most:
         yield _Model(data, known, degree)
@@ -339,20 +334,20 @@ def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
 def _resistant(design, move) -> tuple[np.ndarray, float]:
     """Coefficients (m, 2d) and the median size of the residuals."""
     values, vectors = np.linalg.eigh(design.T @ design)
-    known = values > OPTIONS.spanned * values[-1]
+    known = values > Options.spanned * values[-1]
     turn = vectors[:, known] / np.sqrt(values[known])
     basis, weight = design @ turn, np.ones(len(design))
     coefficients, median = np.zeros((basis.shape[1], move.shape[1])), 0.0
     floor = np.finfo(float).eps * np.abs(move).max(initial=0.0)
-    for n in range(OPTIONS.absolute + OPTIONS.biweight):
+    for n in range(Options.absolute + Options.biweight):
         weighted = basis.T * weight
-        ridge = OPTIONS.spanned * np.eye(len(weighted))
+        ridge = Options.spanned * np.eye(len(weighted))
         coefficients = np.linalg.solve(weighted @ basis + ridge, weighted @ move)
         size = np.linalg.norm(move - basis @ coefficients, axis=1)
         median = max(float(np.median(size)), floor)
         if median == 0:
             break
-        if n < OPTIONS.absolute:
+        if n < Options.absolute:
             weight = median / np.maximum(size, median)
         else:
             weight = _TUKEY.weights(size / median)
@@ -374,11 +369,11 @@ def _borne_out(model: _Model, rows, goes_on, left_out) -> np.ndarray:
         steps = other - one + 1
         if not (begins[one] or ends[other]):
             inner += 1
-            if steps > OPTIONS.longest or not model.bridge(one, steps, other) <= OPTIONS.beyond:
+            if steps > Options.longest or not model.bridge(one, steps, other) <= Options.beyond:
                 continue
             bridged += 1
         kept.append(np.arange(one, other + 1))
-    if not kept or bridged < OPTIONS.bridged * inner:
+    if not kept or bridged < Options.bridged * inner:
         return rows[:0]
     found = np.concatenate(kept)
     return found[~left_out[found]]

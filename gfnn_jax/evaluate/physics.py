@@ -23,23 +23,17 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 
 class Options:
-    """Numerical options.
+    """Numerical options."""
 
-    nodes: of the quadrature over a swing, whose integrand is smooth. amplitudes: that the curve of
-    frequencies has. iterations: of Newton's method for a rest position. starts: in each coordinate,
-    at most ``most`` in all. step: of derivatives of the acceleration, in sizes of the motion.
-    small: of the largest swing, which stands for none; of smaller ones rounding of V would be seen.
-    gravity: m/s², of a simple pendulum.
-    """
-
-    nodes: int = 48
-    amplitudes: int = 24
-    iterations: int = 60
-    starts: int = 5
+    nodes: int = 48  # of the quadrature over a swing, whose integrand is smooth
+    amplitudes: int = 24  # of the curve of frequencies
+    iterations: int = 60  # of Newton's method for a rest position
+    starts: int = 5  # of it in each coordinate, and at most in all
     most: int = 625
-    step: float = 1e-5
+    step: float = 1e-5  # of derivatives of the acceleration, in sizes of the motion
+    # of the largest swing, which stands for none: of smaller ones rounding of V would be seen
     small: float = 1e-2
-    gravity: float = 9.80665
+    gravity: float = 9.80665  # m/s², of a simple pendulum
 
 
 class Quantity(NamedTuple):

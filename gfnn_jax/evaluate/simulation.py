@@ -19,11 +19,11 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 
 class Options:
-    """Sizes of the simulation. points: of the data, which a browser steps through in some ms.
-    errors, share: a slider reaches this many standard errors, and this share of its coefficient, to
-    either side, whichever is more."""
+    """Sizes of the simulation."""
 
-    points: int = 500
+    points: int = 500  # of the data, which a browser steps through in some ms
+    # A slider reaches so many standard errors, and this share of its coefficient, to either side,
+    # whichever is more.
     errors: float = 10.0
     share: float = 0.5
 

@@ -37,16 +37,11 @@ GRAVITY = 9.81  # m/s², by which lengths are in metres where times are in secon
 
 
 class Options:
-    """Options of the links of a law.
+    """Options of the links of a law."""
 
-    states: random ones at which the law is compared with a chain. most: difference of masses and
-    forces of a chain, relative to those of the law, beyond which it is none. still: part of the
-    masses × (rates of the data)², below which gravity is none.
-    """
-
-    states: int = 200
-    most: float = 0.05
-    still: float = 1e-9
+    states: int = 200  # random ones, at which the law is compared with a chain
+    most: float = 0.05  # relative difference of masses and forces, beyond which it is no chain
+    still: float = 1e-9  # of the masses × (rates of the data)², below which gravity is none
 
 
 class Link(NamedTuple):

@@ -357,21 +357,17 @@ static int flow(double *z, double h, const double *u, const double *p)
 
 
 class Options:
-    """Options of the series (`benchmarks/machines.py`).
+    """Options of the series (`benchmarks/machines.py`)."""
 
-    order: the most terms; 28 let one series reach dt in most scenes, where 20, the cheapest for
-    each unit of time (Jorba & Zou), take two. rounding: of a term ÷ (size of its coordinate), that
-    ends a series. most: series of a step, from event to event. scan: places in a series where an
-    event is looked for. rest: speed ÷ all speeds, that rounding leaves of one that is 0. unrolled:
-    sums over products in a law whose loops are written out: a compiler then keeps the coefficients
-    in registers.
-    """
-
+    # The most terms: 28 let one series reach dt in most scenes, where 20, the cheapest for each
+    # unit of time (Jorba & Zou), take two.
     order: int = 28
-    rounding: float = 2.0**-52
-    most: int = 2_000
-    scan: int = 16
-    rest: float = 1e-12
+    rounding: float = 2.0**-52  # of a term ÷ (size of its coordinate), that ends a series
+    most: int = 2_000  # series of a step, from event to event
+    scan: int = 16  # places in a series where an event is looked for
+    rest: float = 1e-12  # speed ÷ all speeds, that rounding leaves of one that is 0
+    # Sums over products in a law whose loops are written out: a compiler then keeps the
+    # coefficients in registers.
     unrolled: int = 6
     first: int = 4  # terms of a series before it is asked whether it ends
 

@@ -46,8 +46,7 @@ from gfnn_jax.models.hamiltonians.search import preferred
 from gfnn_jax.search.search import Entry, OnProgress
 
 
-@dataclasses.dataclass(frozen=True)
-class ChoiceOptions:
+class Options:
     """Limits of the choice and of the error that it states (study: stated_errors)."""
 
     confirmed: float = 1.1  # of the error that the search measured
@@ -65,7 +64,6 @@ class ChoiceOptions:
     of_root: float = 200.0
 
 
-OPTIONS = ChoiceOptions()
 FEWEST_RUNS_TESTED = 10  # runs that state the error for all others
 _WHAT = "the stated error by cross-validation"
 
@@ -109,7 +107,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
     named = f"{law.candidate.label}{request.budget.compilation}"
     request.watch.on_progress(f"compiling the flow of {named}")
     candidate, seconds, *_ = flow_assembled(law, *given)
-    expected = max(bound, OPTIONS.confirmed * law.candidate.validation_bound)
+    expected = max(bound, Options.confirmed * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
     return Chosen(candidate, data, seconds, law=law)
@@ -136,7 +134,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         assembled = measured(entry.candidate, entry.map, data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, assembled.failed, entry))
-        expected = max(bound, OPTIONS.confirmed * entry.candidate.validation_bound)
+        expected = max(bound, Options.confirmed * entry.candidate.validation_bound)
         if not assembled.compiled:
             break
         if np.isfinite(found := assembled.candidate.validation_bound) and found <= expected:
@@ -156,7 +154,7 @@ def _smaller(
         return
     sweep = min(tried, key=lambda t: t[1])[2].sweep
     least = min(sweep.sizes.index(e.size) for _, _, e in tried if e.sweep is sweep)
-    sizes = sweep.sizes[:least][: -OPTIONS.smaller - 1 : -1]
+    sizes = sweep.sizes[:least][: -Options.smaller - 1 : -1]
     for entry in _validated(sweep, sizes, budget, on_progress):
         yield entry
         if not tried[-1][1]:
@@ -200,7 +198,7 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
 
 def work_of_posterior(num_parameters: int) -> float:
     """Operations of computing it."""
-    return OPTIONS.of_root * float(num_parameters) ** 3
+    return Options.of_root * float(num_parameters) ** 3
 
 
 def stated(chosen: Chosen, found: Searched, budget: Budget, on_progress: OnProgress) -> Chosen:
@@ -258,14 +256,14 @@ def _of_steps(chosen: Chosen, found: Searched) -> float:
     law, data = chosen.law, found.data
     if law is None or not law.terms:
         return 0.0
-    rows = np.arange(0, len(data), -(-len(data) * data.y0.shape[1] // OPTIONS.numbers))
+    rows = np.arange(0, len(data), -(-len(data) * data.y0.shape[1] // Options.numbers))
     (dt, args), flow = data.given(rows), law.flow
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     states, params = data.y0[rows], np.asarray(flow.params)
     off = truncation(flow.family, params, states, dt, steps, args=args, scale=data.scale)
     square = np.mean((off / data.scale) ** 2, axis=1)
     square = square[np.isfinite(square)]
-    bound = bound_of_mean(square, np.arange(len(square)), OPTIONS.worst) if len(square) > 1 else 0.0
+    bound = bound_of_mean(square, np.arange(len(square)), Options.worst) if len(square) > 1 else 0.0
     unit = 1.0 if found.tolerance.relative else float(np.sqrt(np.mean(data.spread**2)))
     return unit * float(np.sqrt(bound))
 
@@ -274,12 +272,12 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
     """Warning where few of these errors (n,) make their RMS: then it has no bound that n of them
     tell (the variance of a heavy tail is infinite), and a quantile is stated beside it."""
     rms = float(np.sqrt(np.mean(errors**2)))
-    if not FEW * np.median(errors) < rms < np.inf or rms < OPTIONS.matters * tolerance.bound:
+    if not FEW * np.median(errors) < rms < np.inf or rms < Options.matters * tolerance.bound:
         return ""
     unit = " of the spread" if tolerance.relative else ""
     return (
         "few states make most of the error: nine of ten err by less than "
-        f"{np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}. The 95 % bound of the RMS does not "
+        f"{np.quantile(errors, Options.nine_of_ten):.1e}{unit}. The 95 % bound of the RMS does not "
         "hold for other states: quote that of nine of ten"
     )
 
@@ -292,7 +290,7 @@ def _by_folds(
     model = _refits(chosen, found)
     if model is None:
         return None
-    folds = np.array_split(np.unique(cluster[rows]), OPTIONS.folds)
+    folds = np.array_split(np.unique(cluster[rows]), Options.folds)
     out = [rows[np.isin(cluster[rows], fold)] for fold in folds if len(fold)]
     try:
         work = len(out) * model.work

@@ -20,7 +20,7 @@ import numpy as np
 from gfnn_jax.budget import FLOW
 from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.dataset.measured_error import error_of_each
-from gfnn_jax.diagnosis.outliers import OPTIONS as SCREEN
+from gfnn_jax.diagnosis.outliers import Options as Screen
 from gfnn_jax.diagnosis.outliers import around, named
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.request import Request, diagnose_request
@@ -28,8 +28,7 @@ from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep, Size
 
 
-@dataclasses.dataclass(frozen=True)
-class GrossErrorOptions:
+class Options:
     """Limits by which pairs are told that the map misses by far (study: hard, outliers)."""
 
     # A residual beyond so many times what all but two of its neighbours stay below, and the median
@@ -73,7 +72,6 @@ class GrossErrorOptions:
     of_neighbours: int = 1_400
 
 
-OPTIONS = GrossErrorOptions()
 _WHAT = "the search for pairs that the map misses by far"
 
 
@@ -84,7 +82,7 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
     wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
     watch = dataclasses.replace(request.watch, factors=None, checkpoints=None, on_better=None)
     request = dataclasses.replace(request, watch=watch)
-    for _ in range(OPTIONS.rounds):
+    for _ in range(Options.rounds):
         left = _residuals(found)
         if left is None:
             break
@@ -93,26 +91,26 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
             with request.budget.unit(_WHAT, FLOW, work_of_look):
                 size = sizes()
             middle = np.median(size)
-            known = len(size) > SCREEN.neighbours and middle > 0
-            far = np.flatnonzero(size > OPTIONS.beyond * middle)
+            known = len(size) > Screen.neighbours and middle > 0
+            far = np.flatnonzero(size > Options.beyond * middle)
             if not (known and len(far)):
                 break
             # A search without them is followed by another look at the residuals.
             width = found.data.y0.shape[1]
-            work = OPTIONS.of_trees * len(size) + OPTIONS.of_neighbours * width**2 * len(far)
+            work = Options.of_trees * len(size) + Options.of_neighbours * width**2 * len(far)
             with request.budget.unit(_WHAT, FLOW, work, then=(FLOW, work_of_look)):
-                near = around(found.data, found.data.scale, size, far, OPTIONS.but)
+                near = around(found.data, found.data.scale, size, far, Options.but)
         except OutOfTime:
             request.budget.leave_out(_WHAT, request.budget.ended)
             break
-        rows, rise = _standing_alone(size, far, near, OPTIONS.ordinary), OPTIONS.rise
+        rows, rise = _standing_alone(size, far, near, Options.ordinary), Options.rise
         if not len(rows):
-            rows, rise = _standing_alone(size, far, near, np.inf), OPTIONS.mended
+            rows, rise = _standing_alone(size, far, near, np.inf), Options.mended
         gone = len(wrong) + len(rim) + len(rows)
-        if not len(rows) or gone > OPTIONS.most * count:
+        if not len(rows) or gone > Options.most * count:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
-        if not _rms(size) > OPTIONS.spoilt * _rms(size[others]):
+        if not _rms(size) > Options.spoilt * _rms(size[others]):
             break
         at_rim = _at_the_rim(found, rows)
         request.watch.on_progress(f"without {gone} of {count} pairs that the map misses by far")
@@ -160,7 +158,7 @@ def _residuals(found: Searched) -> tuple[Callable[[], np.ndarray], float] | None
     where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
     best = _best(found)
-    if best is None or tolerance.met_by(best) or best.validation_relative <= OPTIONS.roundoff:
+    if best is None or tolerance.met_by(best) or best.validation_relative <= Options.roundoff:
         return None
     if data.structure is not None or data.varied:
         return None
@@ -210,10 +208,10 @@ def _at_the_rim(found: Searched, rows: np.ndarray) -> bool:
     size = _sizes(left)
     for smaller in reversed(sweep.sizes[: sweep.sizes.index(chosen)]):
         coarse = sweep.residuals(smaller)
-        if np.median(_sizes(coarse)[others]) > OPTIONS.coarser * np.median(size[others]):
+        if np.median(_sizes(coarse)[others]) > Options.coarser * np.median(size[others]):
             differ = _sizes(coarse - left)
-            more = _sizes(coarse)[rows] > OPTIONS.more * size[rows]
-            apart = differ[rows] > OPTIONS.differ * np.median(differ[others])
+            more = _sizes(coarse)[rows] > Options.more * size[rows]
+            apart = differ[rows] > Options.differ * np.median(differ[others])
             return bool(np.mean(more & apart) > 0.5)
     return False
 
@@ -237,13 +235,13 @@ def _standing_alone(
 
     ordinary: times the median of all, that those neighbours' residuals stay below."""
     middle = np.median(size)
-    alone = far[(size[far] > OPTIONS.beyond * around) & (around < ordinary * middle)]
-    between = np.sum((size > OPTIONS.tail * middle) & (size <= OPTIONS.beyond * middle))
-    if between < OPTIONS.apart * len(alone):
+    alone = far[(size[far] > Options.beyond * around) & (around < ordinary * middle)]
+    between = np.sum((size > Options.tail * middle) & (size <= Options.beyond * middle))
+    if between < Options.apart * len(alone):
         return alone
     falling, ordered = alone[np.argsort(-size[alone])], np.sort(size)
     count, least = np.arange(1, len(falling) + 1), size[falling]
-    reach = np.where(count < OPTIONS.several, OPTIONS.wide_gap, OPTIONS.gap) * least
+    reach = np.where(count < Options.several, Options.wide_gap, Options.gap) * least
     below = np.searchsorted(ordered, least) - np.searchsorted(ordered, reach, "right")
-    apart = np.flatnonzero(below < OPTIONS.apart * count)
+    apart = np.flatnonzero(below < Options.apart * count)
     return np.sort(falling[: apart[-1] + 1]) if len(apart) else falling[:0]

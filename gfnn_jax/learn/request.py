@@ -39,8 +39,7 @@ from gfnn_jax.scenes.draws import sample_states
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
 
-@dataclasses.dataclass(frozen=True)
-class RequestOptions:
+class Options:
     """Limits of the first looks at pairs, and what they cost (study: budgets)."""
 
     # by such a factor the states of one scene hardly differ; those in other units do
@@ -57,7 +56,6 @@ class RequestOptions:
     fewest: int = 2_000
 
 
-OPTIONS = RequestOptions()
 FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
 
 
@@ -175,13 +173,13 @@ def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
     if isinstance(scene.sampling, AroundOrbit):
         states = np.asarray(scene.sampling.start)[None, :]
     else:
-        states = np.asarray(sample_states(scene, OPTIONS.compared, jax.random.key(0)))
+        states = np.asarray(sample_states(scene, Options.compared, jax.random.key(0)))
     messages = []
     for name, ours, theirs in zip(
         ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
     ):
         size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
-        if usual > 0 and not 1 / OPTIONS.other_size < size / usual < OPTIONS.other_size:
+        if usual > 0 and not 1 / Options.other_size < size / usual < Options.other_size:
             messages.append(
                 f"the {name} are {size / usual:.2g} times the size of those in {scene.name}, whose "
                 "features assume its own units: are the data in these?"
@@ -195,14 +193,14 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
     # An angle that turned over moves little, whatever the difference of its numbers: the median.
     moved = np.median(np.abs(move / sizes(z0)) if tolerance.relative else np.abs(move), axis=0)
     size = float(np.sqrt(np.mean(moved**2)))
-    if not tolerance.bound > OPTIONS.coarse * size > 0:
+    if not tolerance.bound > Options.coarse * size > 0:
         return []
     unit = "of the coordinates' spread" if tolerance.relative else "in the data's units"
     option = "tolerance" if tolerance.relative else "absolute_tolerance"
     return [
         f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
         f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} to "
-        f"{OPTIONS.coarse * size:.0e} or less"
+        f"{Options.coarse * size:.0e} or less"
     ]
 
 
@@ -233,7 +231,7 @@ def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
     for i in (i for i in range(2 * pairs.dim) if i not in coordinates.angles):
         size = np.abs(move[:, i])
         jumps = size > np.pi
-        if not OPTIONS.fewest_jumps <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
+        if not Options.fewest_jumps <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
             continue
         most = min(1.5 * size[~jumps].max(), np.pi / 2)
         if np.abs(size[jumps] - TWO_PI).max() <= most:
@@ -330,7 +328,7 @@ def checked(
         structure=structure,
     )
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
-    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= OPTIONS.still:
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= Options.still:
         raise FitError(
             "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
             "columns twice?"
@@ -347,8 +345,8 @@ def paid_for(found: Identified, budget: Budget, seed: int) -> Identified:
     """The pairs, or a sample of them, drawn by the seed, where the budget does not pay for all:
     of two degrees of freedom 50,000. That is told with what else was left out."""
     pairs, row = found
-    count, of_pair = len(pairs), OPTIONS.of_pair * (2 * pairs.dim) ** 2
-    most = max(OPTIONS.fewest, int(OPTIONS.of_sample / of_pair))
+    count, of_pair = len(pairs), Options.of_pair * (2 * pairs.dim) ** 2
+    most = max(Options.fewest, int(Options.of_sample / of_pair))
     work = count * of_pair
     if count <= most or budget.pays_for(work):
         return found
@@ -381,8 +379,7 @@ def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
     return diagnosed(data, options.chart, request.reversor, options.seed, may_lose=may_lose)
 
 
-@dataclasses.dataclass(frozen=True)
-class ProposalOptions:
+class Proposals:
     """Rules of when a structure is proposed, or tried first (study: many)."""
 
     fewest_dim: int = 6  # below it a fit needs no structure
@@ -393,7 +390,6 @@ class ProposalOptions:
     tried: float = 0.02
 
 
-PROPOSALS = ProposalOptions()
 _CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
 
 
@@ -401,7 +397,7 @@ def proposed(data: Dataset) -> list[str]:
     """One line that names the structure which explains a sample of the pairs best, to O(h²); none
     where none does. data: without a base map or a structure."""
     best, left = _best(data)
-    if not left < PROPOSALS.explained:
+    if not left < Proposals.explained:
         return []
     return [
         f"the structure {best} explains these pairs: a sample of them leaves relative residuals of "
@@ -416,7 +412,7 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
     named = request.options.terms or request.scene is not None or data.structure is not None
     if request.seeks_law and not (named or request.of_network):
         best, left = _best(data)
-        if left < PROPOSALS.tried:
+        if left < Proposals.tried:
             structure = structure_of(best, data.dim, data.coordinates)
             request.watch.on_progress(
                 f"the structure {best} leaves relative residuals of {left:.1g} in forces and "
@@ -430,7 +426,7 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
 
 def _best(data: Dataset) -> tuple[str, float]:
     """The structure that leaves least of a sample's forces and velocities over, and that part."""
-    if data.dim < PROPOSALS.fewest_dim or data.varied or data.coordinates.angles:
+    if data.dim < Proposals.fewest_dim or data.varied or data.coordinates.angles:
         return "", np.inf
     counts = [data.dim // k for k in (3, 2, 1) if data.dim % k == 0 and data.dim // k > 1]
     possible = ("ring", "chain", *(f"bodies:{count}" for count in counts))
@@ -444,6 +440,6 @@ def _misfit(text: str, data: Dataset) -> float:
     structure = structure_of(text, data.dim)
     assert structure is not None
     libraries = list(structure.libraries(data.dim))
-    small = [family for family in libraries if family.num_parameters <= PROPOSALS.most_terms]
+    small = [family for family in libraries if family.num_parameters <= Proposals.most_terms]
     charts = [CHARTS[name] for name in _CHARTS]
     return min((misfit(f, data, chart) for f in small for chart in charts), default=np.inf)

@@ -23,29 +23,21 @@ from gfnn_jax.scenes.scene import Scene, Section
 States = Float[Array | np.ndarray, "batch phase"]
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
-    """Numbers of a reference.
+    """Numbers of a reference."""
 
-    tolerance: 1e-14 costs 15 % less and drifts ten times more in energy. max_solver_steps: for one
-    dt; a state that needs more is about to collide. lanes_on_cpu: states solved together: more take
-    hardly less time each, and one alone half that of 8. saved_at_once: states of a trajectory that
-    one call of the program returns. longest_return: time allowed for a return to a section; lost
-    orbits run out of steps before.
-    """
-
-    tolerance: float = 1e-15
-    max_solver_steps: int = 1024
+    tolerance: float = 1e-15  # 1e-14 costs 15 % less and drifts ten times more in energy
+    max_solver_steps: int = 1024  # for one dt; a state that needs more is about to collide
+    # solved together: more take hardly less time each, and one alone half that of 8
     lanes_on_cpu: int = 8
     lanes_on_accelerator: int = 4096
-    saved_at_once: int = 64
-    longest_return: float = 1e6
+    saved_at_once: int = 64  # states of a trajectory that one call of the program returns
+    longest_return: float = (
+        1e6  # time of a return to a section; lost orbits run out of steps before
+    )
 
 
-OPTIONS = Options()
-
-
-def _solve(field, span, z, until=None, *, tolerance=OPTIONS.tolerance, predicts=False):
+def _solve(field, span, z, until=None, *, tolerance=Options.tolerance, predicts=False):
     """Integrate dz/dt = field(z, t) from z (2d,) over the times ``span``, (start, end): by Dopri8,
     or where it ``predicts`` by Dopri5, which is then differentiated forwards.
 
@@ -63,7 +55,7 @@ def _solve(field, span, z, until=None, *, tolerance=OPTIONS.tolerance, predicts=
         None,
         z,
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-        max_steps=OPTIONS.max_solver_steps,
+        max_steps=Options.max_solver_steps,
         event=None if until is None else diffrax.Event(lambda t, y, args, **_: until(y)),
         adjoint=diffrax.ForwardMode() if predicts else diffrax.RecursiveCheckpointAdjoint(),
         throw=False,
@@ -130,7 +122,7 @@ class _Dynamics:
             rate = field(x)
             return rate / rate[i]
 
-        x, within = self.section.lift(z), (0.0, OPTIONS.longest_return)
+        x, within = self.section.lift(z), (0.0, Options.longest_return)
         x = _solve(field, within, x, until=lambda x: x[i] < 0)
         x = _solve(field, within, x, until=lambda x: x[i] > 0)
         return self.section.coordinates(_solve(by_coordinate, (x[i], 0.0), x))
@@ -155,7 +147,7 @@ class _Dynamics:
             x = ahead(x, first + every * k)
             return x, saved.at[k].set(x)
 
-        saved = jnp.zeros((OPTIONS.saved_at_once, *x0.shape))
+        saved = jnp.zeros((Options.saved_at_once, *x0.shape))
         return jax.lax.fori_loop(0, count, save, (x0, saved))[1]
 
     @partial(jax.jit, static_argnames=("self",))
@@ -171,7 +163,7 @@ def _blocks(num):
 
     The last state fills up the last block. A state has the same bits beside any others, for the
     solver controls the steps of each lane alone."""
-    lanes = OPTIONS.lanes_on_cpu if jax.default_backend() == "cpu" else OPTIONS.lanes_on_accelerator
+    lanes = Options.lanes_on_cpu if jax.default_backend() == "cpu" else Options.lanes_on_accelerator
     for first in range(0, num, lanes):
         yield np.minimum(np.arange(first, first + lanes), num - 1)
 
@@ -207,8 +199,8 @@ class Reference:
         saved, times = np.empty((num_saved, *x0.shape)), (self.dt, self.period)
         for rows in _blocks(len(x0)):
             start = x = x0[rows]
-            for done in range(0, num_saved, OPTIONS.saved_at_once):
-                count, first = min(OPTIONS.saved_at_once, num_saved - done), done * save_every
+            for done in range(0, num_saved, Options.saved_at_once):
+                count, first = min(Options.saved_at_once, num_saved - done), done * save_every
                 part = self.dynamics.continued(start, x, first, count, save_every, times)
                 saved[done : done + count, rows] = np.asarray(part)[:count]
                 x = saved[done + count - 1, rows]

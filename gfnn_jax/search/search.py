@@ -26,8 +26,7 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
-@dataclasses.dataclass(frozen=True)
-class SearchOptions:
+class Options:
     """Rules of when a sweep is left, and which of its sizes are validated (study: constants)."""
 
     # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing
@@ -50,7 +49,6 @@ class SearchOptions:
     farthest: float = 3.0
 
 
-OPTIONS = SearchOptions()
 MET = "the tolerance is met"
 # A size whose error ÷ the least before it is more than this has gained nothing; a sweep whose least
 # error, times this, is no larger than the best one's has come as far.
@@ -248,10 +246,10 @@ class Search:
         self._entries.append(entry)
         relative = estimated.validation_relative
         # Something to keep should the search be interrupted is worth a few more looks.
-        keep = self._on_validated is not None and relative < OPTIONS.kept * self._kept
+        keep = self._on_validated is not None and relative < Options.kept * self._kept
         self._kept = min(self._kept, relative) if keep else self._kept
-        ratio = 1.0 / OPTIONS.calibrated if climb.ratio is None else climb.ratio
-        if keep or ratio * estimated.validation_bound <= OPTIONS.within_reach * self._bound:
+        ratio = 1.0 / Options.calibrated if climb.ratio is None else climb.ratio
+        if keep or ratio * estimated.validation_bound <= Options.within_reach * self._bound:
             entry = self._validated(entry, self._budget)
             error = entry.candidate.validation_relative
             if np.isfinite(error) and relative > 0:
@@ -266,7 +264,7 @@ class Search:
         climb.stalled = climb.stalled + 1 if relative > GAINED * climb.best else 0
         climb.best = min(climb.best, relative)
         climb.beaten += any(_beats(e.candidate, estimated) for e in self._entries)
-        climb.left |= climb.stalled == OPTIONS.stalled or climb.beaten == OPTIONS.beaten
+        climb.left |= climb.stalled == Options.stalled or climb.beaten == Options.beaten
         climb.errors.append((size.order, estimated.validation_bound))
         for hopeless in [c for c in self._climbs if self._is_hopeless(c)]:
             hopeless.left = True
@@ -275,7 +273,7 @@ class Search:
         """Return whether the sweep's largest size would miss the bound by far, where another sweep
         has a smaller error already, or has come as far and leads to the bound."""
         end = climb.end
-        if not (OPTIONS.far * self._bound < end < np.inf):
+        if not (Options.far * self._bound < end < np.inf):
             return False
         return any(
             other.reached < end
@@ -331,7 +329,7 @@ def _promised(climbs: Sequence[_Climb], bound: float) -> str:
     """Extrapolation of the most accurate sweep's errors to a size that would meet the bound;
     nothing where they stall, or are too few to say."""
     best = min(climbs, key=lambda climb: climb.reached, default=None)
-    decay = None if best is None or best.stalled == OPTIONS.stalled else best.decay
+    decay = None if best is None or best.stalled == Options.stalled else best.decay
     if best is None or decay is None:
         return ""
     order = decay.order_for(bound)
@@ -363,7 +361,7 @@ def _finalists(entries: list[Entry]) -> list[Entry]:
     as_good = [e for e in best[1:] if _as_good(e, best[0])]
     second = sorted(as_good, key=lambda e: e.candidate.operations)[:1]
     best = [*best[:1], *second, *(e for e in best[1:] if e not in second)]
-    return best[: OPTIONS.finalists]
+    return best[: Options.finalists]
 
 
 def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
@@ -384,7 +382,7 @@ def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
 def _as_good(entry: Entry, best: Entry) -> bool:
     """Return whether an entry's error is no larger than the best one's but for what is not worth
     while."""
-    limit = OPTIONS.no_worse * best.candidate.validation_relative
+    limit = Options.no_worse * best.candidate.validation_relative
     return entry.candidate.validation_relative <= limit
 
 
@@ -416,7 +414,7 @@ def _why(climbs: Sequence[_Climb]) -> str:
     error tell nothing."""
     least = min((climb.best for climb in climbs), default=np.inf)
     good = [c for c in climbs if c.sweep.sizes and GAINED * c.best <= least]
-    if any(climb.stalled == OPTIONS.stalled for climb in good):
+    if any(climb.stalled == Options.stalled for climb in good):
         return "larger models are no more accurate"
     if any(climb.sweep.short_of_pairs for climb in good):
         return "the pairs determine no larger model: more pairs would help"
@@ -446,7 +444,7 @@ class Decay(NamedTuple):
             return None
         fall = max(math.log(self.error / bound), 0.0)
         found = self.order + self.spacing * math.ceil(fall / (self.rate * self.spacing) - 1e-9)
-        far = found - self.first > OPTIONS.farthest * max(self.order - self.first, self.spacing)
+        far = found - self.first > Options.farthest * max(self.order - self.first, self.spacing)
         return None if far else found
 
 
@@ -457,7 +455,7 @@ def decay_of(sizes: Sequence[tuple[float, float]]) -> Decay | None:
     of the last two, each over two gains, so that a sweep is rather thought to be good.
     """
     finite = [(x, e) for x, e in sizes if 0 < e < math.inf]
-    if not finite or finite[-1][0] - finite[0][0] < OPTIONS.range:
+    if not finite or finite[-1][0] - finite[0][0] < Options.range:
         return None
     gains = finite[:1]
     for order, error in finite[1:]:

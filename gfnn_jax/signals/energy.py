@@ -24,17 +24,14 @@ POWERS = {"dry": 1, "linear": 2, "quadratic": 3}
 
 
 class _Options:
-    """stretches: lengths in periods. blocks: of stretches, whose scatter tells errors. clearly:
-    standard errors, by which one kind of friction leaves less than the others. balanced: part of
-    the changes of ½v₁² that the balance must explain. significant: standard errors of a loss, and
-    its least size. Chosen on motions of test systems with known friction (tests of signals)."""
+    """Limits, chosen on motions of test systems with known friction (tests of signals)."""
 
-    stretches: tuple[float, ...] = (0.25, 0.6, 1.0, 2.0)
-    blocks: int = 12
-    clearly: float = 3.0
-    balanced: float = 0.9
+    stretches: tuple[float, ...] = (0.25, 0.6, 1.0, 2.0)  # lengths in periods
+    blocks: int = 12  # of stretches, whose scatter tells errors
+    clearly: float = 3.0  # standard errors, by which one kind of friction leaves less than others
+    balanced: float = 0.9  # of the changes of ½v₁², that the balance explains
     ridge: float = 1e-9
-    significant: tuple[float, float] = (3.0, 1e-4)
+    significant: tuple[float, float] = (3.0, 1e-4)  # standard errors of a loss, and its least size
 
 
 @dataclasses.dataclass(frozen=True)

@@ -97,20 +97,17 @@ def _windows(times: Runs, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 class _Options:
-    """halves: windows, samples on either side. samples: where the errors of a window are measured.
-    tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's
-    range, below which an error is that of a constant. orders: of differences; fewest: of them that
-    tell noise; biased: share of the noise that cubics tell, below which that is theirs; least: of
-    the range, below which what a start of a law leaves is the error of its steps."""
+    """Windows, and when what they leave is noise."""
 
+    # samples on either side
     halves: tuple[int, ...] = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)
-    samples: int = 2_000
-    tolerance: float = 1.05
-    rounding: float = 1e-13
-    orders: tuple[int, ...] = tuple(range(4, 11))
-    fewest: int = 20
-    biased: float = 0.1
-    least: float = 1e-6
+    samples: int = 2_000  # where the errors of a window are measured
+    tolerance: float = 1.05  # of the leave-one-out error, against the best window's
+    rounding: float = 1e-13  # of a channel's range, below which an error is that of a constant
+    orders: tuple[int, ...] = tuple(range(4, 11))  # of differences
+    fewest: int = 20  # of them that tell noise
+    biased: float = 0.1  # share of the noise that cubics tell, below which that is theirs
+    least: float = 1e-6  # of the range: what a start of a law leaves by the error of its steps
 
 
 class Smooth(NamedTuple):

@@ -25,23 +25,17 @@ _SIZES = (9, 11, 13, 15, 19, 23, 29, 37, 45, 57, 71, 89, 111, 139, 173, 217, 271
 
 
 class _Options:
-    """Thresholds, chosen on noise of known size on motions of test systems (tests of signals).
+    """Thresholds, chosen on noise of known size on motions of test systems (tests of signals)."""
 
-    degree: of the polynomials. growth: exponent of s²(n) above which it is the motion that grows.
-    trimmed: part of the windows, those with the largest residuals, that may hold outliers. fewest:
-    windows. rare: part of the samples that outliers are at most. unresolved: part of a column's
-    spread, above which what polynomials leave is the motion itself. lags, most_rows: of an
-    autoregression. white: autocorrelation beyond that of white noise which is no accident."""
-
-    degree: int = 5
-    growth: float = 1.5
-    trimmed: float = 0.02
-    fewest: int = 8
-    rare: float = 3e-3
-    unresolved: float = 0.3
-    lags: int = 16
+    degree: int = 5  # of the polynomials
+    growth: float = 1.5  # exponent of s²(n) above which it is the motion that grows
+    trimmed: float = 0.02  # of the windows: those of the largest residuals, which may hold outliers
+    fewest: int = 8  # windows
+    rare: float = 3e-3  # of the samples, that outliers are at most
+    unresolved: float = 0.3  # of a column's spread, above which polynomials leave the motion itself
+    lags: int = 16  # of an autoregression, fitted to so many rows
     most_rows: int = 20_000
-    white: float = 0.15
+    white: float = 0.15  # autocorrelation beyond that of white noise which is no accident
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,24 +13,20 @@ from gfnn_jax.signals.steps import dominant_frequencies
 
 
 class _Options:
-    """periods: of the slowest oscillation, in a window. fewest: samples of a window, for each
-    oscillation. places: where states are told. dense, cells: values a period of
-    the fastest peak, and at the most, of which lines are made, and lines: of these. width: of an
-    oscillation, whose frequency follows its size, in 2π over the record. clear: standard errors,
-    and weak: size beside the strongest, of a line. imitated: size beside a stronger one, below
-    which a line may be its tone, or come of how its size changes. sets: that are told."""
+    """Windows, and lines of their spectra."""
 
-    periods: float = 1.5
-    fewest: int = 8
-    places: int = 64
-    dense: int = 10
+    periods: float = 1.5  # of the slowest oscillation, in a window
+    fewest: int = 8  # samples of a window, for each oscillation
+    places: int = 64  # where states are told
+    dense: int = 10  # values a period of the fastest peak, of which lines are made, and at the most
     cells: int = 400
     lines: int = 12
-    width: float = 2.0
-    clear: float = 5.0
-    weak: float = 2e-3
+    width: float = 2.0  # of one whose frequency follows its size, in 2π over the record
+    clear: float = 5.0  # standard errors of a line
+    weak: float = 2e-3  # its size beside the strongest
+    # size beside a stronger one, below which a line may be its tone, or come of how that changes
     imitated: float = 0.5
-    sets: int = 3
+    sets: int = 3  # that are told
 
 
 class Oscillations(NamedTuple):

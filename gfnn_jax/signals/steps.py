@@ -13,21 +13,16 @@ Runs = Sequence[np.ndarray]  # an array of each run
 
 
 class _Options:
-    """gap: times the 95th percentile of the steps, above which a step is a gap. even: part of a
-    step that times may be off. drifting: samples, at least, of a run whose drift is told. nearby:
-    steps whose median counts those in a gap. parabola: part of the squares of times' deviations
-    from even ones that a drift explains. longest: samples of a segment of a spectrum. across:
-    periods of the strongest line, up to which a spectrum goes over a gap on a straight line. kept:
-    periods that a part between longer gaps must have."""
+    """Gaps, drifts and spectra."""
 
-    gap: float = 1.5
-    even: float = 0.05
-    drifting: int = 100
-    nearby: int = 101
-    parabola: float = 0.97
-    longest: int = 1 << 16
-    across: float = 0.25
-    kept: float = 2.0
+    gap: float = 1.5  # times the 95th percentile of the steps, above which a step is a gap
+    even: float = 0.05  # of a step, that times may be off
+    drifting: int = 100  # samples, at least, of a run whose drift is told
+    nearby: int = 101  # steps whose median counts those in a gap
+    parabola: float = 0.97  # of the squares of times' deviations from even ones: a drift's part
+    longest: int = 1 << 16  # samples of a segment of a spectrum
+    across: float = 0.25  # periods of the strongest line, over which a gap is a straight line
+    kept: float = 2.0  # periods that a part between longer gaps has
 
 
 def median_step(times: Runs) -> float:

@@ -33,47 +33,33 @@ TURN = 2 * np.pi
 
 class _Options:
     """Thresholds, chosen on recordings of test systems with and without wrong values
-    (`benchmarks/random_recordings.py`).
+    (`benchmarks/random_recordings.py`)."""
 
-    Roughness: samples of a block, of which the roughest counts; part of the blocks that are
-    ordinary (what spoils fewer than the others is not the sensor's way).
-
-    Outliers are suspected at ``suspected`` times the median miss of ``nearby`` samples, which is
-    ``of_median`` of white noise of unit size. joined: samples from one suspected one to the next of
-    the same stretch; beside: on either side, whose cubics an outlier spoils; longest: of a stretch;
-    side: on either side of it, as many as it has if these are more, fitted by a polynomial of this
-    degree; widest: of the duration of so many samples without a gap. far: standard deviations of
-    what the sides tell; rough: times the ordinary roughness; of_turn: part of a turn, that one must
-    be away from it; abrupt: times as far off as the sample beside it, that its ends are.
-
-    Stuck are at least ``fewest`` equal values (two or three are what a camera makes of a frame that
-    it dropped) among ``around`` steps before and behind; jump: times the fastest of these, at
-    least; resolutions: that the motion goes in a step (slower, equal values are a sensor's digits).
-
-    At jumps: smooth: degree of the polynomial of each side; beyond: part of the jump by which the
-    sample is beyond both sides, for the overshoot of a real one is less."""
-
-    block: int = 16
-    ordinary: float = 0.8
-    suspected: float = 10.0
+    # Roughness
+    block: int = 16  # samples, of which the roughest counts
+    ordinary: float = 0.8  # of the blocks: what spoils fewer than the others is not the sensor's
+    # Outliers
+    suspected: float = 10.0  # times the median miss of samples nearby
     nearby: int = 64
-    of_median: float = 0.94
-    joined: int = 6
-    beside: int = 2
-    longest: int = 40
-    side: int = 8
-    degree: int = 5
-    widest: float = 1.5
-    far: float = 10.0
-    rough: float = 3.0
-    of_turn: float = 0.1
-    abrupt: float = 3.0
-    fewest: int = 5
-    around: int = 8
-    jump: float = 3.0
-    resolutions: float = 2.0
-    smooth: int = 3
-    beyond: float = 0.5
+    of_median: float = 0.94  # that miss, of white noise of unit size
+    joined: int = 6  # samples from one suspected one to the next of the same stretch
+    beside: int = 2  # on either side, whose cubics an outlier spoils
+    longest: int = 40  # of a stretch
+    side: int = 8  # on either side of it, as many as it has if these are more, fitted by a
+    degree: int = 5  # polynomial of this degree
+    widest: float = 1.5  # of the duration of so many samples without a gap
+    far: float = 10.0  # standard deviations of what the sides tell
+    rough: float = 3.0  # times the ordinary roughness
+    of_turn: float = 0.1  # of a turn, that one is away from it
+    abrupt: float = 3.0  # times as far off as the sample beside it, that its ends are
+    # Stuck
+    fewest: int = 5  # equal values: two or three are what a camera makes of a frame that it dropped
+    around: int = 8  # steps before and behind
+    jump: float = 3.0  # times the fastest of these, at least
+    resolutions: float = 2.0  # of the motion in a step: slower, equal values are a sensor's digits
+    # At jumps
+    smooth: int = 3  # degree of the polynomial of each side
+    beyond: float = 0.5  # of the jump, beyond both sides: the overshoot of a real one is less
 
 
 @dataclasses.dataclass(frozen=True)
