@@ -8,8 +8,6 @@
 Names are loaded when first used, so that importing the package costs nothing.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

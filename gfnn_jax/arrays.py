@@ -4,8 +4,6 @@ Functions here and in the families ask an array for its namespace. In a fit arra
 nothing is compiled. Inside a step they are traced by JAX.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from itertools import combinations_with_replacement

@@ -7,8 +7,6 @@ operations that were done then says which units they were, and gives the same mo
 the clock. Without a budget nothing looks at the clock.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

@@ -4,8 +4,6 @@ Each exit status but 0 comes with one line that gives the reason (`cli_parser`).
 only after the usage has been checked.
 """
 
-from __future__ import annotations
-
 import argparse
 import atexit
 import contextlib

@@ -4,8 +4,6 @@ about a recording's columns and rows.
 JAX is not loaded.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import dataclasses

@@ -1,7 +1,5 @@
 """Print what a command has found: tables, errors, the law, where the map may be trusted."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Compilation by XLA: options that shorten it, and a cache on disk between processes."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable

@@ -5,8 +5,6 @@ coordinates must be canonical (its Jacobian D satisfies Dᵀ J D = J), so that a
 symplectic in the inner coordinates is symplectic in the user's.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from functools import partial

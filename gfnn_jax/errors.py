@@ -4,8 +4,6 @@ A message is written once, with options as the command line has them: ``--degree
 calls from Python reads ``degrees=['angle']``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import re

@@ -5,8 +5,6 @@ communicate while they work, and wait for each other once, at the end. The proce
 `Group`: the first tells the others what to do, and their answers are merged along a binary tree.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """Threads of the linear algebra that NumPy and SciPy call."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from functools import cache
 

@@ -3,8 +3,6 @@
 `METHODS` names them; each is ``learn(sequences, budget) -> Learned``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

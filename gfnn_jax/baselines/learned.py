@@ -13,8 +13,6 @@ code, greydanus/hamiltonian-nn, experiment-2body: 200-200 tanh, Adam at 1e-3, ba
 and outputs of unit size, and a decay of the rate.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -14,8 +14,6 @@ which serves noisy data. There are two variants for systems that are not separab
   the step is symplectic up to the distance that the copies gain in one step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

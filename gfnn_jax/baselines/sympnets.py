@@ -15,8 +15,6 @@ bentaps/strupnet, method P. A layer conserves its own w·z, so that
 is the exact flow. Any linear symplectic map is such a row with quadratic f.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

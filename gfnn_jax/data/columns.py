@@ -1,7 +1,5 @@
 """The columns of a recording: their roles, which are angles, their units, their σ."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

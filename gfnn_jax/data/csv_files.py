@@ -1,7 +1,5 @@
 """States q, p in text files of any dialect: columns t, q1 …, p1 …, a sequence, parameters."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import warnings

@@ -4,8 +4,6 @@ Each check yields faults, one line each: what was found, and what mends it. A fa
 the recording cannot be learned from as it is read; the others are notes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping

@@ -19,8 +19,6 @@ through the same checks. Every refusal is an `InputError`: one line that says wh
 and what came. Nothing here needs JAX, so that a refusal comes at once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

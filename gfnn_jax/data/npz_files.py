@@ -1,7 +1,5 @@
 """Arrays in .npy and .npz files, opened without loading them whole."""
 
-from __future__ import annotations
-
 import math
 import os
 import warnings

@@ -7,8 +7,6 @@ entered in a journal with its SHA-256. A process killed at any moment thus loses
 at, and a chunk that is damaged or half written is found out and computed again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -4,8 +4,6 @@ Each check yields faults that propose options: `gfnn look` puts them into the co
 nothing is done without them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -1,8 +1,6 @@
 """Data taken as `gfnn look` proposes: what ``gfnn FILE``, `gfnn_jax.discover` and `gfnn_jax.fit` do
 with a file or a table that nobody has described."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The summary of a recording: what its samples tell before anything is fitted; on one screen."""
 
-from __future__ import annotations
-
 import dataclasses
 import html
 import io

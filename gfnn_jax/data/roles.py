@@ -1,7 +1,5 @@
 """The roles of a recording's columns, by their names."""
 
-from __future__ import annotations
-
 import keyword
 import re
 import unicodedata

@@ -4,8 +4,6 @@ Arcs of consecutive pairs are kept or left out together: what is fitted to seque
 by them, needs pairs that go on. Which arcs are kept is told by a hash of their run and place.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

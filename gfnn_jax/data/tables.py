@@ -1,8 +1,6 @@
 """Tables of named columns, of memory and of files of arrays; their rows cut into runs whose times
 rise."""
 
-from __future__ import annotations
-
 import dataclasses
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

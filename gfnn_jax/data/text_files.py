@@ -3,8 +3,6 @@
 All text goes through here: recordings, and states q, p (`csv_files`).
 """
 
-from __future__ import annotations
-
 import csv
 import itertools
 import re

@@ -5,8 +5,6 @@ the rows between its marks. Lines that are none of the table are blank, so that 
 stay those of the file.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import io

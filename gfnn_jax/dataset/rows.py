@@ -1,7 +1,5 @@
 """The rows of the least-squares problem of S, from the rows of a data set."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ A run is a trajectory that was measured; the place of a pair is the number of it
 run. Two pairs of a run whose places differ by one share a state, and its noise.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

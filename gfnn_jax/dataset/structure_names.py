@@ -1,7 +1,5 @@
 """Names of structures of many degrees of freedom, as a user writes them. JAX is not loaded."""
 
-from __future__ import annotations
-
 import re
 
 STRUCTURES = (

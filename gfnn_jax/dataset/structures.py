@@ -4,8 +4,6 @@ bodies.
 A structure tells which libraries of terms are tried, and by what the domain of the data is known.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Iterator, Sequence

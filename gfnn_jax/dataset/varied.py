@@ -5,8 +5,6 @@ A Hamiltonian serves any dt and, as a function of the parameters too, any system
 generating function is that of one map; in the midpoint chart it may be a function of dt as well.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -13,8 +13,6 @@ S alone: a constant determinant is not enough, which two oscillators of differen
 which charts cover them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from functools import partial

@@ -4,8 +4,6 @@ The Jacobians give the determinant of each chart over the data, and how symplect
 Neighbours also tell which pairs are outliers, and the residuals of a fit whether there is friction.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -15,8 +15,6 @@ rest by a gap, has its like around it, or is not bridged by the states before an
 nothing is said.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -10,8 +10,6 @@ Friction, −ρ_i p_i, is no such field: beside a K of as many terms as the pair
 coefficient like others, with a standard error.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

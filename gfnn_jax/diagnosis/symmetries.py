@@ -6,8 +6,6 @@ makes ∇H at R z the image of that at z: gradients at the midpoints of some pai
 hold them, are compared with the images of others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple

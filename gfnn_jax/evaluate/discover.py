@@ -1,7 +1,5 @@
 """``gfnn.discover``: from data to a report in one call."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from pathlib import Path

@@ -6,8 +6,6 @@ serves the colour-blind and grey print: each method has a colour, a marker and a
 place in the mapping. The reference is black and comes first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Style of all figures, and how they are written."""
 
-from __future__ import annotations
-
 import io
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Forecasts of a part of a recording that no fit has seen, from states along it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple

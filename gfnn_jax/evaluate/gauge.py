@@ -8,8 +8,6 @@ the learned map at positions of the flow are then
 c and f the same everywhere, and in these momenta the two maps are one.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ made, so that all methods are measured alike. Measures of saved arrays are NumPy
 elements and Lyapunov exponents also work inside a jitted computation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

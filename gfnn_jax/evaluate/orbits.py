@@ -1,7 +1,5 @@
 """Orbits of maps: rotation numbers, and periodic orbits with their stability."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 

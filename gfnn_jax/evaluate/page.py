@@ -3,8 +3,6 @@
 Formulas are MathML, figures are SVG inside the page: browsers show both without a script.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator, Sequence

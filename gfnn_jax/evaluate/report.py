@@ -4,8 +4,6 @@ All keys are always present. A value that does not apply, or is not finite, is n
 that was learned from a recording has the law's own keys beside them.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any, NamedTuple
 

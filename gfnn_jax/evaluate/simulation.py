@@ -1,8 +1,6 @@
 """The simulation in a report: a law as JavaScript beside its data, with a slider for each of its
 coefficients."""
 
-from __future__ import annotations
-
 import json
 import re
 from importlib.resources import files

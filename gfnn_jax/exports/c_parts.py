@@ -2,8 +2,6 @@
 `solve.newton`, whose `iterate` explains it, with that module's constants.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfnn_jax.coordinates import TWO_PI

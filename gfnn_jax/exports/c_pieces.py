@@ -4,8 +4,6 @@ The args follow the state in z and in w: parameters, the time of a drive, coeffi
 piece does not change them. Polynomials of many terms are arranged by Horner's scheme.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ All formulas come from the package's own lines, run on symbols. S is solved by N
 keeps no state, so that several threads may call it at once.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence

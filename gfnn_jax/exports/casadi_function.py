@@ -1,7 +1,5 @@
 """A law as a CasADi function, for optimal control: the home of CasADi, an extra."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Function ``gfnn.export``: a map for programs that know nothing of this package."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

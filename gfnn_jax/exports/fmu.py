@@ -5,8 +5,6 @@ stick; model exchange gives the rates, dry friction smoothed. The sources go alo
 that of the machine that writes the file, where it has a C compiler.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import platform

@@ -8,8 +8,6 @@ of that speed: with σ as a number, f is analytic. The package's own lines run o
 (`exports.symbols`); no formula is written a second time.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A law as JavaScript: the C of its Taylor series with other declarations."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

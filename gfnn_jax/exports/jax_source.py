@@ -5,8 +5,6 @@ Newton's method, whose last iteration carries the derivative of the implicit fun
 backward.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Formulas for people, for parsers, and as sympy reads them: its home."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence

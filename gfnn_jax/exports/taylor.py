@@ -13,8 +13,6 @@ turns, that of the force which holds a body when it exceeds what friction holds;
 has the series of this force as one unknown more of each order, from d^k(c·v)/dt^k = 0.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Figures of runs and comparisons: learned methods with the reference; statistics of chaos."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Jobs of ``gfnn fit``: states or recordings in, a model folder with its report out."""
 
-from __future__ import annotations
-
 import shlex
 import time
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ end, columns run, t, each position and std_ of each. Times are in the unit of th
 gone on from, and so are values; of columns that it lacks in those of the law's.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from collections.abc import Mapping

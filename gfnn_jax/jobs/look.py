@@ -1,7 +1,5 @@
 """Job of ``gfnn look``: a recording read, summed up, drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """Rollouts of test states, timed without compilation, and measured against the reference: errors,
 energy, growth. The same for every method."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 """Output of a job: where it goes, what may stand there, its progress; a model with its record, and
 recordings in the units of the one that it was learned from."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

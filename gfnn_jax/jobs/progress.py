@@ -1,7 +1,5 @@
 """Progress messages of a job, and their display on standard error."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import sys

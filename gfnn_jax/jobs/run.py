@@ -1,7 +1,5 @@
 """Job of ``gfnn run``: reference data of a scene, fit, rollouts, metrics, figures, report."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

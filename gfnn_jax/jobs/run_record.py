@@ -1,8 +1,6 @@
 """Job of ``gfnn FILE`` and ``gfnn run RECORD``: the law of the first two thirds of a recording,
 forecasts of its last third, which no fit sees, and the report of both as one page."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

@@ -8,8 +8,6 @@ fifth: one run knows nothing of the amplitudes of the others. Where rows are sca
 decides whether a size is determined at all: the final map is then fitted to the test rows too.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence

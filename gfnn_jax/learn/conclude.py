@@ -1,7 +1,5 @@
 """Conclusion of a fit: why the search ended, and the residuals where nothing is met."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ cost is counted (floating-point operations per predicted step), so that one seed
 same map; the measured time stands beside it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence

@@ -10,8 +10,6 @@ That the residuals of all pairs are looked at is work of the search: it is left 
 the budget has no room for it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

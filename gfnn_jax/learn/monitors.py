@@ -11,8 +11,6 @@ the maps of all places in a row are that of a turn. Where the readings of two mo
 it is learned with latent readings.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from functools import reduce

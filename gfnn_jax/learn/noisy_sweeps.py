@@ -8,8 +8,6 @@ every size on fresh pairs follows from one factor, as Mallows' C_p does (Technom
 661).
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Sequence

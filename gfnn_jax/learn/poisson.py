@@ -1,8 +1,6 @@
 """``gfnn.fit`` of states with another bracket than that of (q, p): the law ż = B(z)∇H(z), the
 bracket given or found, and its map."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 import warnings

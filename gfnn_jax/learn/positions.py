@@ -5,8 +5,6 @@ the best → where larger ones leave as much, and so the readings have noise, S 
 → its map, measured by its own steps from positions that were held out.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterator, Sequence

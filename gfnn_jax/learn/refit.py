@@ -7,8 +7,6 @@ of S are those of its least-squares problem, of H those of a Gauss–Newton prob
 coefficients. Pairs that the map of the sample misses by far, and those held out, give none.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 import warnings

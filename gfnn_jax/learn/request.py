@@ -7,8 +7,6 @@ before anything is begun; otherwise whole runs are left aside. That is decided b
 clock of a busy machine changes no sample.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ What was found is a tree of registered types, as a map is. The data are not in t
 only the search needed; the kinds of friction that are seen are computed before.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -9,8 +9,6 @@ natural laws from experimental data*, Science 324 (2009) 81, supplementary data;
 were estimated by the authors.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Scenes that come with the package, each a `Scene`, by function and by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 from collections.abc import Callable

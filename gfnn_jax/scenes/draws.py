@@ -4,8 +4,6 @@ Every key is a ``jax.random.key``; everything is float64 and needs x64 to be on.
 own function is one program for each number of states.
 """
 
-from __future__ import annotations
-
 import numbers
 from functools import lru_cache, partial
 

@@ -1,7 +1,5 @@
 """Scenes: dynamics + coordinates + sampling law + dt, as data and small pure functions."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping

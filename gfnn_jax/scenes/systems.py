@@ -1,7 +1,5 @@
 """The systems that come with the package: dynamics and sampling laws, each scene one function."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from functools import partial

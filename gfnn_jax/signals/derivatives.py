@@ -9,8 +9,6 @@ is a linear regression for the factor s and the lag τ. Noise of ẋ, which is k
 makes the factor of a plain regression too small, and is taken out of the sum of squares.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -10,8 +10,6 @@ angles, their sums and differences, or polynomials of lengths. No acceleration i
 has been fitted: θ is a means to the loss.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Local polynomials: least squares in windows of consecutive samples, at uneven times."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

@@ -11,8 +11,6 @@ If the samples are even, σ is then what a linear autoregression leaves of a sam
 those before it and from the inputs. Both estimates are upper bounds; the smaller one is taken.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Oscillations of a few frequencies in one series: what of it belongs to each, window by window."""
 
-from __future__ import annotations
-
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 

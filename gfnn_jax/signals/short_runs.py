@@ -11,8 +11,6 @@ leaves motion; but then what neighbouring equations of a run leave is not correl
 readings that they share. The first degree is taken at which it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import comb
 

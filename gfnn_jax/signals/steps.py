@@ -1,8 +1,6 @@
 """Steps between samples: their median, gaps, whether they are even, whether a clock drifts; spectra
 of series."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -18,8 +18,6 @@ An input may jump and may be a pulse. What it cannot be is smooth on both sides 
 sample between them that is far beyond either (`wrong_at_jumps`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

@@ -11,8 +11,6 @@ It appears under its name only when it is complete. Loading reads data only: no 
 loaded file.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

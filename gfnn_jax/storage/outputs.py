@@ -5,8 +5,6 @@ An unfinished job keeps its work in the folder ``OUT.partial`` until its output 
 Nothing here needs JAX, so that a refusal comes at once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json
