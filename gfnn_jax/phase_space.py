@@ -245,18 +245,8 @@ class Pairs:
         (dt, period, runs, own_kind), (z0, z1, args, run, place, std, *own) = fixed, leaves
         run = run if runs is None else np.array(runs)
         structure, names = own_kind
-        return cls(
-            z0,
-            z1,
-            own[0] if own else dt,
-            args,
-            period=period,
-            run=run,
-            place=place,
-            std=std,
-            structure=structure,
-            names=names,
-        )
+        about = {"period": period, "structure": structure, "names": names}
+        return cls(z0, z1, own[0] if own else dt, args, **about, run=run, place=place, std=std)
 
     def __len__(self) -> int:
         return self.z0.shape[0]
@@ -272,17 +262,8 @@ class Pairs:
         args = self.args and {name: values[rows] for name, values in self.args.items()}
         run, place = (None if of is None else of[rows] for of in (self.run, self.place))
         std = self.std[rows] if np.ndim(self.std) == 2 else self.std
-        return dataclasses.replace(
-            self,
-            z0=self.z0[rows],
-            z1=self.z1[rows],
-            dt=dt,
-            t0=None,
-            args=args,
-            run=run,
-            place=place,
-            std=std,
-        )
+        states = {"z0": self.z0[rows], "z1": self.z1[rows], "dt": dt, "t0": None, "args": args}
+        return dataclasses.replace(self, **states, run=run, place=place, std=std)
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:

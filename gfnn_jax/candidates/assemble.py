@@ -77,16 +77,10 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     images, solved = refined_images(data, generated.chart, generated.family, generated.params, rows)
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = data.y1[rows], np.ones(len(rows), bool)
-    args = data.given(rows[solved])[1]
+    args, dt = data.given(rows[solved])[1], of_lanes(data.given(rows)[0], solved)
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
-    fitted = fit_predictors(
-        generated.chart,
-        data.y0[rows][solved],
-        images[solved],
-        of_lanes(data.given(rows)[0], solved),
-        partial(inputs_of, data, features=features),
-        args,
-    )
+    inputs, y0 = partial(inputs_of, data, features=features), data.y0[rows][solved]
+    fitted = fit_predictors(generated.chart, y0, images[solved], dt, inputs, args)
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)
 
@@ -99,16 +93,9 @@ def composed(piece: Piece, data: Dataset) -> SymplecticMap:
         parameters = sampled(data.parameters, data.args, data.each_dt, data.period)
     if data.own_dt is not None and isinstance(piece, Generated):
         dt_range = np.array([data.own_dt.min(), data.own_dt.max()])
-    map_ = SymplecticMap(
-        pieces=(*data.before, piece, *data.after),
-        coordinates=data.coordinates,
-        domain=data.domain,
-        scale=data.spread,
-        angle_centre=data.angle_centre,
-        dt=data.dt,
-        parameters=parameters,
-        dt_range=dt_range,
-    )
+    pieces = (*data.before, piece, *data.after)
+    where = data.coordinates, data.domain, data.spread, data.angle_centre, data.dt
+    map_ = SymplecticMap(pieces, *where, parameters=parameters, dt_range=dt_range)
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
 

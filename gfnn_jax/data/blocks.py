@@ -51,13 +51,9 @@ class Block:
 
     def rows(self, index: np.ndarray) -> Block:
         locate = self.locate  # `self` would keep all rows in memory
-        return Block(
-            self.states[index],
-            self.sequence[index],
-            self.place[index],
-            lambda r, c: locate(int(index[r]), c),
-            None if self.own is None else self.own[index],
-        )
+        columns = self.states[index], self.sequence[index], self.place[index]
+        own = None if self.own is None else self.own[index]
+        return Block(*columns, lambda r, c: locate(int(index[r]), c), own)
 
     @property
     def going(self) -> np.ndarray:
@@ -83,12 +79,9 @@ def joined(blocks: Iterable[Block], dim: int) -> Block:
     """Checked blocks of states (n, 2 · dim) one behind another; none may be there."""
     parts = [Block(np.empty((0, 2 * dim)), np.empty(0), np.empty(0, int)), *blocks]
     own = [block.own for block in parts if block.own is not None]
-    return Block(
-        np.concatenate([block.states for block in parts]),
-        np.concatenate([block.sequence for block in parts]),
-        np.concatenate([block.place for block in parts]),
-        own=np.concatenate(own) if own else None,
-    )
+    columns = zip(*((one.states, one.sequence, one.place) for one in parts), strict=True)
+    states, sequence, place = map(np.concatenate, columns)
+    return Block(states, sequence, place, own=np.concatenate(own) if own else None)
 
 
 @dataclasses.dataclass(frozen=True)

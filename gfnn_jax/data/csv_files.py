@@ -52,15 +52,9 @@ class _StatesInText:
             self.period = blocks.check_dt(first["period"][0], f"{self.path}: the column period")
         further = (*self.states, "t", "sequence", "period")
         self.parameters = [n for n in self.names if n not in (*further, *moving)]
-        self.source = blocks.Source(
-            dim,
-            dt,
-            self.blocks,
-            units={n.lower(): unit for n, unit in self.file.units.items()},
-            parameters=tuple(re.sub(r"\W+", "_", name) for name in self.parameters),
-            period=self.period,
-            timed=self.with_time,
-        )
+        self.source = blocks.Source(dim, dt, self.blocks, period=self.period, timed=self.with_time)
+        self.source.units = {n.lower(): unit for n, unit in self.file.units.items()}
+        self.source.parameters = tuple(re.sub(r"\W+", "_", name) for name in self.parameters)
 
     def _check_header(self) -> None:
         """Raises InputError where columns are missing, or are without a partner."""

@@ -119,18 +119,8 @@ def read_trajectories(
         warnings.warn(f"{path}: {odd}", blocks.DataWarning, stacklevel=2)
     known = (labels(sequence[going]), whole.place[going])
     identities = (None, None) if source.of_pairs_alone else known
-    return TrajectoryData(
-        states,
-        lengths,
-        dt,
-        str(path),
-        digest_of(path),
-        source.precision,
-        source.units,
-        args,
-        source.period,
-        *identities,
-    )
+    told = source.precision, source.units, args, source.period
+    return TrajectoryData(states, lengths, dt, str(path), digest_of(path), *told, *identities)
 
 
 def labels(sequence: np.ndarray) -> np.ndarray:
@@ -193,14 +183,8 @@ def iterate_pairs(
                     if source.of_pairs_alone:
                         pair, run = run, _arcs_of_pairs(run, z0, z1, *last_arc)
                         along, last_arc = pair - run, (int(run[-1]), z1[-1])
-                    yield Pairs(
-                        z0,
-                        z1,
-                        *source.of_pairs(block.own, rows),
-                        period=source.period,
-                        run=run + number * FILE_STEP,
-                        place=along,
-                    )
+                    run, given = run + number * FILE_STEP, source.of_pairs(block.own, rows)
+                    yield Pairs(z0, z1, *given, period=source.period, run=run, place=along)
 
 
 def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Arrays in .npy and .npz files, opened without loading them whole."""
 
+import dataclasses
 import math
 import os
 import warnings
@@ -204,13 +205,9 @@ class _Sequences(NamedTuple):
                 if of_pairs:
                     states = np.stack(several, axis=1).reshape(-1, 2 * dim)
                 number = row + np.arange(len(states))
-                block = Block(
-                    states,
-                    number // length,
-                    number % length,
-                    lambda r, c, n=row: locate(n + r, c),
-                    None if own is None else own[number],
-                )
+                sequence, place = np.divmod(number, length)
+                told = None if own is None else own[number]
+                block = Block(states, sequence, place, lambda r, c, n=row: locate(n + r, c), told)
                 if self.lengths is not None:
                     kept = block.place < self.lengths[block.sequence]
                     block = block.rows(np.flatnonzero(kept))
@@ -218,18 +215,12 @@ class _Sequences(NamedTuple):
                 if len(block.states):
                     yield block
 
-        dtypes = [one.dtype for one in self.arrays]
-        return Source(
-            dim,
-            self.dt,
-            blocks,
-            precision=str(np.result_type(*dtypes) if of_pairs else dtypes[0]),
-            parameters=names,
-            uneven=self.uneven,
-            period=self.period,
-            timed=self.times is not None,
-            of_pairs_alone=of_pairs,
+        precision = str(
+            np.result_type(*(a.dtype for a in self.arrays)) if of_pairs else array.dtype
         )
+        source = Source(dim, self.dt, blocks, precision, parameters=names, uneven=self.uneven)
+        timed = self.times is not None
+        return dataclasses.replace(source, period=self.period, timed=timed, of_pairs_alone=of_pairs)
 
 
 def open_npy(request: Request, stream) -> Source:

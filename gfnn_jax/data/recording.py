@@ -226,13 +226,9 @@ class Recording:
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
+        moving = {**roles, "positions": coordinate_names}
         angular, radians = angles_of(
-            source,
-            {**roles, "positions": coordinate_names},
-            angles or (),
-            names_of["degrees"],
-            angles is None,
-            units,
+            source, moving, angles or (), names_of["degrees"], angles is None, units
         )
         factors = {name: radians.get(name, 1.0) for name in numbers}
         factors |= {of: factors[name] for name, of in sigmas.items()}

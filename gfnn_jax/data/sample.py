@@ -76,20 +76,9 @@ def read_sample(
     states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     each = float(found["dt"][0]) if same and len(states) else found["dt"]
-    return files.TrajectoryData(
-        states,
-        np.full(len(found["pairs"]), 2),
-        each,
-        files.named(paths),
-        digest,
-        precision,
-        units,
-        args or None,
-        period,
-        found["run"],
-        found["place"],
-        int(total),
-    )
+    lengths, sources = np.full(len(found["pairs"]), 2), files.named(paths)
+    about = digest, precision, units, args or None, period, found["run"], found["place"]
+    return files.TrajectoryData(states, lengths, each, sources, *about, sampled=int(total))
 
 
 def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:

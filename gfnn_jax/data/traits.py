@@ -214,16 +214,9 @@ def accelerations(traits: Traits, inputs: Sequence[str]) -> Accelerations | None
     if fits is None:
         return None
     dim = len(names)
-    found = Accelerations(
-        fits.values[:dim],
-        fits.slopes[:dim],
-        fits.curvatures[:dim],
-        fits.values[dim:],
-        fits.run,
-        fits.centres,
-    )
-    every = np.concatenate([found.q, found.v, found.a, found.u])
-    known = np.asarray(np.isfinite(every).all(axis=0))
+    (q, v, a), u = (x[:dim] for x in (fits.values, fits.slopes, fits.curvatures)), fits.values[dim:]
+    found = Accelerations(q, v, a, u, fits.run, fits.centres)
+    known = np.asarray(np.isfinite(np.concatenate([q, v, a, u])).all(axis=0))
     return found.taken(known) if known.sum() >= 2 * _Options.block else None
 
 

@@ -219,14 +219,9 @@ class Dataset:
 
     def take(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, each in its part; sizes and domain are theirs."""
-        return dataclasses.replace(
-            self,
-            pairs=self.pairs.take(rows),
-            row=self.row[rows],
-            y0=self.y0[rows],
-            y1=self.y1[rows],
-            split=self.split.take(rows),
-        )._measured()
+        each = {name: getattr(self, name)[rows] for name in ("row", "y0", "y1")}
+        pairs, split = self.pairs.take(rows), self.split.take(rows)
+        return dataclasses.replace(self, pairs=pairs, split=split, **each)._measured()
 
     def lifted_anew(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, their angles lifted among themselves, nothing factored out and all

@@ -3,13 +3,8 @@
 import re
 
 STRUCTURES = (
-    "poisson",
-    "ring",
-    "chain",
-    "bodies:N",
-    "ring:FIELDS",
-    "chain:FIELDS",
-    "bodies:N:SPECIES",
+    *("poisson", "ring", "chain", "bodies:N"),
+    *("ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES"),
 )
 EXPECTED = f"a structure among {', '.join(STRUCTURES)} (one alone)"
 _SITES, _BODIES = r"(ring|chain)(:[1-9][0-9]?)?", r"bodies:0*([2-9]|[1-9][0-9]+)(:[A-Za-z]+)?"

@@ -294,14 +294,11 @@ class _Problem:
             return LearnedDamping(
                 np.asarray(factor[0]), np.asarray(std[0]), np.asarray(found.shift[0])
             )
-        return LearnedDamping(
-            factor,
-            std,
-            found.shift,
-            found.functions,
+        names, extremes = (
             self.data.parameters,
             (np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))),
         )
+        return LearnedDamping(factor, std, found.shift, found.functions, names, extremes)
 
     def _families(self, spread, factor) -> Iterator[Products]:
         """Families by rising degree, those that the training rows determine in reasonable time."""

@@ -74,14 +74,11 @@ def candidates_figure(fit: Any) -> Figure | None:
     shown = [c for c in fit.candidates if np.isfinite(c.validation_relative)]
     if fit.chosen not in shown:
         return None
-    return speed_against_error(
-        [c.operations / 1e3 for c in shown],
-        [c.validation_relative for c in shown],
-        [_labelled(c) for c in shown],
-        shown.index(fit.chosen),
-        fit.tolerance,
-        estimated=[i for i, c in enumerate(shown) if not c.validated],
-    ).figure  # pyright: ignore[reportReturnType]
+    costs, errors = [c.operations / 1e3 for c in shown], [c.validation_relative for c in shown]
+    labels, chosen = [*map(_labelled, shown)], shown.index(fit.chosen)
+    estimated = [i for i, c in enumerate(shown) if not c.validated]
+    ax = speed_against_error(costs, errors, labels, chosen, fit.tolerance, estimated)
+    return ax.figure  # pyright: ignore[reportReturnType]
 
 
 def _labelled(candidate: Any) -> str:

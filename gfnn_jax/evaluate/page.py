@@ -149,13 +149,10 @@ def write_refusal(recording: Recording, error: Exception, folder: Path, about: A
     result["data"] = {**refused["data"], "source": recording.source}
     summary = recording.summary()
     drawn = _svg(of_recordings.recording_figure(recording, summary), "The recording.")
+    lines = [*about.notes, *recording.notes, *map(str, summary.faults)]
     sections = [
         Section("Why", lines=[str(error)]),
-        Section(
-            "The data",
-            lines=[*about.notes, *recording.notes, *map(str, summary.faults)],
-            figures=[drawn],
-        ),
+        Section("The data", lines=lines, figures=[drawn]),
         Section("To do next", lines=[summary.command]),
         _made(float("nan"), about.command),
     ]
@@ -192,18 +189,11 @@ def _of_law(
         own = data.slice(run=max(data.runs, key=lambda name: np.ptp(data.times(name))))
         begin = of_recordings.begin_of(own, fit.learned_to)
         yield Section("Simulation", script=simulation(law, own, begin))
-    if law.traces and fit.data is not None:
-        yield Section(
-            "Residuals",
-            lines=[f"{name}: residuals {one.text}." for name, one in law.whiteness.items()],
-            figures=[
-                _svg(
-                    of_recordings.residuals_figure(law, fit.data),
-                    "Measured minus law along the arcs of "
-                    "the fit: against time, the channel, and its rate of change.",
-                )
-            ],
-        )
+    if law.traces and data is not None:
+        caption = "Measured minus law along the arcs of the fit: against time, the channel, and its"
+        drawn = _svg(of_recordings.residuals_figure(law, data), f"{caption} rate of change.")
+        lines = [f"{name}: residuals {one.text}." for name, one in law.whiteness.items()]
+        yield Section("Residuals", lines=lines, figures=[drawn])
     yield Section("Not identified", lines=list(_not_identified(law)))
     heads = ("alternative", "odds of this law against it", "")
     yield Section("Rivals", heads=heads, rows=list(_rivals(law)))
@@ -231,13 +221,9 @@ def _coming(fit: Fit, law: LearnedLaw) -> list[tuple[str, str]]:
     """Figure of the forecast from the end of what was learned from."""
     if fit.data is None:
         return []
-    return [
-        _svg(
-            of_recordings.coming_figure(law, fit.data, fit.learned_to),
-            "Forecast from one state at the "
-            "dashed line on, and what was measured. Two standard deviations are shaded.",
-        )
-    ]
+    caption = "Forecast from one state at the dashed line on, and what was measured. Two standard"
+    drawn = of_recordings.coming_figure(law, fit.data, fit.learned_to)
+    return [_svg(drawn, f"{caption} deviations are shaded.")]
 
 
 def _forecasts(

@@ -368,23 +368,17 @@ def _mode(
     if imag[0] <= 1e-9 * size:
         return [Quantity(f"{name}: rate of decay", -real[0], real[1], "1/s", "overdamped")]
     of_shape = f"amplitudes {shape}" if shape else ""
-    found = [
-        Quantity(f"{name}: frequency", imag[0] / (2 * np.pi), imag[1] / (2 * np.pi), "Hz", of_shape)
-    ]
+    rate, of_rate = imag[0] / (2 * np.pi), imag[1] / (2 * np.pi)
+    found = [Quantity(f"{name}: frequency", rate, of_rate, "Hz", of_shape)]
     if abs(real[0]) <= 1e-9 * size:
         return found
     ratio, of_ratio = -real[0] / size, real[1] / size
+    decay, of_decay = -1 / real[0], real[1] / real[0] ** 2
     return [
         *found,
         Quantity(f"{name}: damping ratio ζ", ratio, of_ratio, "", "by viscous friction"),
         Quantity(f"{name}: quality factor Q", 1 / (2 * ratio), of_ratio / (2 * ratio**2), ""),
-        Quantity(
-            f"{name}: time of decay to 1/e",
-            -1 / real[0],
-            real[1] / real[0] ** 2,
-            "s",
-            "of the amplitude",
-        ),
+        Quantity(f"{name}: time of decay to 1/e", decay, of_decay, "s", "of the amplitude"),
     ]
 
 
@@ -394,15 +388,8 @@ def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
     at = f"swings of ± {a:.3g} {unit}".rstrip()
     drift = swings.frequency[-1] / swings.frequency[0] - 1
     against = f"{100 * drift:+.2g} % against small swings" if abs(drift) > 1e-6 else "as small ones"
-    found = [
-        Quantity(
-            f"{at}, without friction: frequency",
-            float(swings.frequency[-1]),
-            float(swings.frequency_std[-1]),
-            "Hz",
-            against,
-        )
-    ]
+    rate, error = float(swings.frequency[-1]), float(swings.frequency_std[-1])
+    found = [Quantity(f"{at}, without friction: frequency", rate, error, "Hz", against)]
     if np.isfinite(swings.quality[-1]):
         about = "2π × energy ÷ energy lost in a period, by all friction"
         if system.law.friction.count > system._viscous().friction.count:

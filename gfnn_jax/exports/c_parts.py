@@ -13,12 +13,8 @@ from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK, ST
 
 _EPS = float(np.finfo(np.float64).eps)
 
-_STATUSES = {
-    OK: "OK",
-    LEFT_DOMAIN: "LEFT_DOMAIN",
-    NOT_CONVERGED: "NOT_CONVERGED",
-    NON_FINITE: "NON_FINITE",
-}
+_STATUSES = {OK: "OK", LEFT_DOMAIN: "LEFT_DOMAIN", NOT_CONVERGED: "NOT_CONVERGED"}
+_STATUSES[NON_FINITE] = "NON_FINITE"
 STATUSES = "; ".join(f"{code} {STATUS_NAMES[code]}" for code in _STATUSES)
 
 INCLUDES = f"""\

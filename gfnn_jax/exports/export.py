@@ -37,16 +37,8 @@ def _c_of_law(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
 
 
 Printer = Callable[[SymplecticMap, str, Mapping[str, Any]], str | bytes]
-_PRINTERS: dict[str, Printer] = {
-    "c": c_source,
-    "c-taylor": _c_of_law,
-    "js": javascript,
-    "jax": jax_source,
-    "casadi": casadi_function,
-    "fmu": fmu,
-    "mjcf": mjcf,
-    "urdf": urdf,
-}
+_PRINTERS: dict[str, Printer] = {"c": c_source, "c-taylor": _c_of_law, "js": javascript}
+_PRINTERS |= {"jax": jax_source, "casadi": casadi_function, "fmu": fmu, "mjcf": mjcf, "urdf": urdf}
 _KEYWORDS_OF_C = re.compile(
     r"auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for"
     r"|goto|if|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct"

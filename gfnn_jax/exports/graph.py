@@ -141,21 +141,12 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     names = coordinate_names(dim) if bracket is None else bracket.labels
     of_terms = piece.family if bracket is None else getattr(piece.family, "family", piece.family)
     terms = tuple(of_terms.term_names) if plain or bracket is not None else ()
-    return LawGraph(
-        tape,
-        list(rates),
-        speeds,
-        limits,
-        directions,
-        names,
-        (*base, *inputs),
-        terms,
-        params if plain else np.zeros(0),
-        tuple(series),
-        time,
-        float(map_.dt),
-        np.asarray(map_.scale, float),
+    of_friction, values = (speeds, limits, directions), params if plain else np.zeros(0)
+    named, scales = (
+        (names, (*base, *inputs), terms),
+        (float(map_.dt), np.asarray(map_.scale, float)),
     )
+    return LawGraph(tape, list(rates), *of_friction, *named, values, tuple(series), time, *scales)
 
 
 def _of_bracket(bracket: Bracket, piece: Any, p, z, args) -> list[Any]:

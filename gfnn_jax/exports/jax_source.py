@@ -51,13 +51,8 @@ def jax_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     body = "\n".join(f"    {line}" for line in named)
     rule = gauss(piece.stages)
     comment = "\n".join(f"{key}: {value}" for key, value in about.items())
-    tables = {
-        "COUPLING": rule.coupling,
-        "WEIGHTS": rule.weights,
-        "NODES": rule.nodes,
-        "SCALE": graph.scale,
-        "COEFFICIENTS": graph.values,
-    }
+    tables = {"COUPLING": rule.coupling, "WEIGHTS": rule.weights, "NODES": rule.nodes}
+    tables |= {"SCALE": graph.scale, "COEFFICIENTS": graph.values}
     numbers = "\n".join(f"{key} = np.array({value.tolist()})" for key, value in tables.items())
     # u as the graph has it: the polynomials of inputs at a time τ, and the time of a drive.
     at_time = [

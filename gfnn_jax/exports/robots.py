@@ -246,22 +246,14 @@ def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
         told = (f"{n} = {row}" for n, row in zip(names, rows, strict=True))
         notes.append(f"the columns of the data: {', '.join(told)}")
     down = np.array([0.0, 0.0, -1.0])
-    links = [
-        Link(
-            f"joint{j + 1}",
-            j - 1,
-            False,
-            masses[j],
-            centres[j] * down,
-            inertias[j] * np.diag([1.0, 1.0, 1e-3]),
-            Rotation.from_euler("y", -zeros[j]),
-            (lengths[j - 1] if j else 0.0) * down,
-            np.array([0.0, 1.0, 0.0]),
-            chain.rotors[j],
-            lengths[j] or 2 * centres[j] or 1.0,
+    links = []
+    for j in range(dim):
+        body = masses[j], centres[j] * down, inertias[j] * np.diag([1.0, 1.0, 1e-3])
+        frame = Rotation.from_euler("y", -zeros[j]), (lengths[j - 1] if j else 0.0) * down
+        axis, drawn = np.array([0.0, 1.0, 0.0]), lengths[j] or 2 * centres[j] or 1.0
+        links.append(
+            Link(f"joint{j + 1}", j - 1, False, *body, *frame, axis, chain.rotors[j], drawn)
         )
-        for j in range(dim)
-    ]
     inputs = dict(zip(named, gains.T, strict=True))
     return Robot(links, damping, dry, inputs, gravity * down, notes, float(map_.dt))
 
@@ -276,20 +268,10 @@ def _of_arm(map_: SymplecticMap, law: BodiesLaw) -> Robot:
         m, centre = J[3, 3], J[:3, 3] / J[3, 3]
         second = J[:3, :3] - m * np.outer(centre, centre)
         about = np.trace(second) * np.eye(3) - second
-        links.append(
-            Link(
-                name,
-                bodies.parents[i],
-                bodies.sliding[i],
-                float(m),
-                centre,
-                about,
-                Rotation.from_matrix(np.asarray(bodies.rotations[i])),
-                np.asarray(bodies.origins[i]),
-                np.asarray(bodies.axes[i]),
-                float(law.rotors[i]),
-            )
-        )
+        place, body = (bodies.parents[i], bodies.sliding[i]), (float(m), centre, about)
+        turned = Rotation.from_matrix(np.asarray(bodies.rotations[i]))
+        frame = turned, np.asarray(bodies.origins[i]), np.asarray(bodies.axes[i])
+        links.append(Link(name, *place, *body, *frame, float(law.rotors[i])))
     damping, dry, left_out = _of_rows(law.friction, law.losses, np.eye(len(links)))
     offsets = ", ".join(f"{n} {c:.6g}" for n, c in zip(bodies.names, law.offsets, strict=True))
     notes = [f"constant forces that the joints hold against, left out: {offsets}", *left_out]

@@ -19,13 +19,8 @@ import numpy as np
 _LONGEST = 90  # characters of an expression that is written where it is used
 _SUM, _PRODUCT, _ATOM = range(3)  # how tightly an operation binds
 _BINDS = {"+": _SUM, "-": _SUM, "*": _PRODUCT, "/": _PRODUCT}
-_ARITHMETIC: dict[str, Callable] = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": operator.truediv,
-    "negative": operator.neg,
-}
+_ARITHMETIC: dict[str, Callable] = {"+": operator.add, "-": operator.sub, "*": operator.mul}
+_ARITHMETIC |= {"/": operator.truediv, "negative": operator.neg}
 # NumPy's names of functions, which it calls as methods of objects, and those of C.
 FUNCTIONS = {n: n for n in ("cos", "sin", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")}
 FUNCTIONS["arctan"] = "atan"

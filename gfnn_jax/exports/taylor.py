@@ -582,14 +582,8 @@ def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None
     unrolled: whether the sums are written out, by default those of small laws.
     """
     rows = _Rows(graph, None if coefficients else graph.values.tolist(), unrolled)
-    sizes = {
-        "DIM": graph.dim,
-        "WIDTH": rows.width,
-        "ORDER": Options.order,
-        "SIZE": rows.size,
-        "ROWS": rows.num,
-        "MOST_SERIES": Options.most,
-    }
+    sizes = {"DIM": graph.dim, "WIDTH": rows.width, "ORDER": Options.order, "SIZE": rows.size}
+    sizes |= {"ROWS": rows.num, "MOST_SERIES": Options.most}
     tables = {"double scale[WIDTH]": map(literal, graph.scale)}
     numbers = {"ROUNDING": Options.rounding}
     if not rows.unrolled:

@@ -266,11 +266,7 @@ def compare(
     if output.resume and _already_done(output.out, job, chosen):
         return None
     with outputs.unfinished(
-        output.out,
-        job,
-        what="comparison",
-        overwrite=output.overwrite,
-        resume=output.resume,
+        output.out, job, what="comparison", overwrite=output.overwrite, resume=output.resume
     ) as kept_in:
         data = SharedData(scene, seed, quick)
         for method in chosen:

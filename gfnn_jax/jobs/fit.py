@@ -94,25 +94,17 @@ def fit(
         return None
     for text in summary(trajectories):
         progress.line(text)
-    job = {
-        "command": "fit",
-        "data": trajectories.digest,
-        "dt": None if np.ndim(trajectories.dt) else trajectories.dt,
-        "scene": scene_name,
-        **asked.deciding,
-    }
+    one_dt = None if np.ndim(trajectories.dt) else trajectories.dt
+    job = {"command": "fit", "data": trajectories.digest, "dt": one_dt, "scene": scene_name}
+    job |= asked.deciding
     if output.holds(job):
         group.broadcast({})
         return None
     with output.unfinished(job) as kept_in:
         try:
+            kept = kept_in, job
             fitted = search(
-                trajectories.pairs(),
-                scene,
-                asked,
-                progress=progress,
-                spent=reading,
-                kept=(kept_in, job),
+                trajectories.pairs(), scene, asked, progress=progress, spent=reading, kept=kept
             )
             why, again = why_not(fitted.map), None
             if fitted.chosen.learns == "hamiltonian" and anything_told(asked.terms):
@@ -123,35 +115,21 @@ def fit(
                 why = f"no time, it would take about {seconds:.2g} s"
                 last = fitted.budget.last(_TO_ALL, READING, seconds, decides=True)
                 progress.status("fitting the chosen model to all pairs")
+                given: dict[str, Any] = {"test": fitted.test_pairs, "scene": scene, "group": group}
+                to_all = partial(refit, fitted, pairs, fitted.validation_pairs, **given)
                 with failures_of_arithmetic(), row_blocks.on_devices(own):
-                    again = within(
-                        last,
-                        partial(
-                            refit,
-                            fitted,
-                            pairs,
-                            fitted.validation_pairs,
-                            test=fitted.test_pairs,
-                            scene=scene,
-                            group=group,
-                        ),
-                    )
+                    again = within(last, to_all)
             if again is None:
                 group.broadcast({})
                 again = not_refitted(fitted, why) if large else fitted
             fitted = again
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
-            result = fitted.report(
-                data={
-                    "source": trajectories.source,
-                    "digest": trajectories.digest,
-                    "precision": trajectories.precision,
-                    "units": trajectories.units,
-                    "dt": _range(trajectories.dt),
-                    "params": {n: _range(v) for n, v in (trajectories.args or {}).items()},
-                },
-            )
+            named = ("source", "digest", "precision", "units")
+            about = {name: getattr(trajectories, name) for name in named}
+            params = {n: _range(v) for n, v in (trajectories.args or {}).items()}
+            about |= {"dt": _range(trajectories.dt), "params": params}
+            result = fitted.report(data=about)
         except KeyboardInterrupt as stop:
             if note := publish(kept_in / BEST, output.out):
                 stop.add_note(note)

@@ -172,23 +172,14 @@ def search(
     factors, and the best map so far, and the job that they belong to. Raises InputError for data or
     a request that cannot give a map, WorkError where the arithmetic fails.
     """
-    checkpoints = factors = on_better = None
+    watch: dict[str, Any] = {"spent": spent, "on_progress": progress.status}
+    watch["on_candidate"] = lambda candidate: progress.line(line(candidate))
     if kept is not None:
         kept_in, job = kept
-        checkpoints, factors = TrainingCheckpoints(kept_in, job), KeptFactors(kept_in)
-        on_better = partial(_keep, kept_in / BEST, scene, job)
+        watch |= {"checkpoints": TrainingCheckpoints(kept_in, job), "factors": KeptFactors(kept_in)}
+        watch["on_better"] = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
-        return fit(
-            data,
-            scene,
-            options=options,
-            spent=spent,
-            checkpoints=checkpoints,
-            factors=factors,
-            on_progress=progress.status,
-            on_candidate=lambda candidate: progress.line(line(candidate)),
-            on_better=on_better,
-        )
+        return fit(data, scene, options=options, **watch)
 
 
 def _keep(

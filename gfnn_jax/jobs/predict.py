@@ -271,16 +271,9 @@ class _Prediction:
             if TIME in names:
                 drive = params[:, -1], float(np.asarray(parameters.period))
                 own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
-        return predictions.PredictionJob(
-            identity,
-            begin.z0.shape,
-            self.asked.num_steps,
-            abs(float(self.map.dt)),
-            self.asked.save_every,
-            self.drawn is not None,
-            own,
-            drive,
-        )
+        steps = self.asked.num_steps, abs(float(self.map.dt)), self.asked.save_every
+        has_bands = self.drawn is not None
+        return predictions.PredictionJob(identity, begin.z0.shape, *steps, has_bands, own, drive)
 
     def written(self, out: Path, begin: _Begin, identity: dict[str, Any]) -> Predicted:
         """Predict these lanes into one file."""

@@ -86,14 +86,8 @@ def run(
     if asked.family == "features" and scene.features is None:
         raise InputError(f"family 'features': the scene {name} declares none, take another family")
     num_trajectories = sizes.trajectories
-    job = {
-        "command": "run",
-        "scene": name,
-        "dt": scene.dt,
-        "num_pairs": num_pairs,
-        "quick": quick,
-        **asked.deciding,
-    }
+    job = {"command": "run", "scene": name, "dt": scene.dt, "num_pairs": num_pairs, "quick": quick}
+    job |= asked.deciding
     if output.holds(job, MODEL):
         return None
     with output.unfinished(job) as kept_in:

@@ -103,16 +103,10 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
             if of_map:
                 return _told(learn_positions(pairs, options, watch))
             try:
-                law = fit_recording(
-                    pairs,
-                    friction=options.friction,
-                    input_hold=options.input_hold,
-                    mass=options.mass,
-                    terms=tuple(options.terms),
-                    loss=options.loss,
-                    hidden=options.hidden,
-                    on_progress=watch.on_progress,
-                )
+                names = ("friction", "input_hold", "mass", "loss", "hidden")
+                asked = {name: getattr(options, name) for name in names}
+                asked |= {"terms": tuple(options.terms), "on_progress": watch.on_progress}
+                law = fit_recording(pairs, **asked)
             except FitError as error:
                 if error.fit is not None:
                     error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict}, pairs)

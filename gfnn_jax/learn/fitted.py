@@ -141,14 +141,9 @@ class Choice:
     @classmethod
     def of(cls, budget: Budget, tested: Pairs, **known: Any) -> Choice:
         """Make the one that this budget paid for, with the pairs that its map is measured at."""
-        return cls(
-            test_states=np.asarray(tested.z0),
-            test_args=tested.args,
-            seconds=budget.seconds,
-            operations=budget.operations,
-            budget=budget,
-            **known,
-        )
+        known |= {"test_states": np.asarray(tested.z0), "test_args": tested.args}
+        spent = {"seconds": budget.seconds, "operations": budget.operations}
+        return cls(**known, **spent, budget=budget)
 
     @property
     def law(self) -> LearnedHamiltonian | None:
@@ -550,12 +545,9 @@ class Fit:
         messages = self.budget.left_out[known:]
         for message in messages:
             warnings.warn(message, FitWarning, stacklevel=2)
-        found = self.replaced(
-            map=map_,
-            messages=(*self.messages, *messages),
-            defect_known=defect is not None,
-            seconds=self.budget.seconds,
-        )
+        told, known = (*self.messages, *messages), defect is not None
+        seconds = self.budget.seconds
+        found = self.replaced(map=map_, messages=told, defect_known=known, seconds=seconds)
         if defect is not None:
             found.__dict__["symplecticity_defect"] = defect
         return found

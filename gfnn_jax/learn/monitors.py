@@ -232,12 +232,6 @@ def _pairs(states: list[list[np.ndarray]], k: int, dt: float) -> Pairs:
 
 def _linear(matrix: np.ndarray, pairs: Pairs, like: SymplecticMap) -> SymplecticMap:
     """The map of a known stretch, in the coordinates of a learned one."""
-    none = np.zeros(len(matrix))
-    return SymplecticMap(
-        pieces=(Affine(matrix, none, none),),
-        coordinates=like.coordinates,
-        domain=covering(pairs.z0),
-        scale=sizes(pairs.z0),
-        angle_centre=np.zeros(0),
-        dt=pairs.dt,
-    )
+    z, none = pairs.z0, np.zeros(len(matrix))
+    pieces, angles = (Affine(matrix, none, none),), np.zeros(0)
+    return SymplecticMap(pieces, like.coordinates, covering(z), sizes(z), angles, pairs.dt)

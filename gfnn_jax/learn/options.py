@@ -46,10 +46,8 @@ def _one_of(*choices: str, or_holds: Callable[[Any], bool] = lambda value: False
 
 
 def _whole(low: int, bits: int) -> Kind:
-    def holds(value: Any) -> bool:
-        return isinstance(value, Integral) and low <= int(value) < 2**bits
-
-    return Kind(f"a whole number from {low} to 2**{bits} - 1", holds, int)
+    words = f"a whole number from {low} to 2**{bits} - 1"
+    return Kind(words, lambda v: isinstance(v, Integral) and low <= int(v) < 2**bits, int)
 
 
 def _is_positive(value: Any) -> bool:
@@ -60,10 +58,6 @@ def _is_text_or_function(value: Any) -> bool:
     return isinstance(value, str) or callable(value)
 
 
-def _is_family(value: Any) -> bool:
-    return callable(value) or hasattr(value, "term_gradients")
-
-
 def _are(test: Callable[[Any], bool], *kinds: type) -> Callable[[Any], bool]:
     return lambda values: isinstance(values, kinds) and all(test(value) for value in values)
 
@@ -71,10 +65,6 @@ def _are(test: Callable[[Any], bool], *kinds: type) -> Callable[[Any], bool]:
 def _same(value: Any, default: Any) -> bool:
     """Return whether an option has its default, or nothing where the default is nothing."""
     return value is default or (not default and not value) or value == default
-
-
-def _texts(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
 POSITIVE = Kind("a finite number > 0", _is_positive, float)
@@ -100,7 +90,7 @@ _OPERATIONS = Kind(
 _TERMS = Kind(
     "a sequence of texts or functions of z, () for none, or a mapping of texts to coefficients",
     lambda v: not isinstance(v, str) and _are(_is_text_or_function, Sequence, Mapping)(v),
-    _texts,
+    lambda text: tuple(filter(None, map(str.strip, text.split(";")))),
 )
 _TEXT = Kind("text", lambda v: isinstance(v, str))
 _LAW = Kind("a Hamiltonian as text or a function of z", _is_text_or_function)
@@ -292,7 +282,10 @@ OPTIONS: dict[str, About] = {
         "|".join(STRUCTURES),
     ),
     "family": About(
-        _one_of("auto", "polynomial", "features", "sines", "mlp", or_holds=_is_family),
+        _one_of(
+            *("auto", "polynomial", "features", "sines", "mlp"),
+            or_holds=lambda value: callable(value) or hasattr(value, "term_gradients"),
+        ),
         "family of the generating function: polynomial (Fourier in angles), features (the "
         "scene's), sines, mlp (also of an H that is a network); in Python also a family of one's "
         "own that is linear in its parameters, or a function of Inputs that gives such families",

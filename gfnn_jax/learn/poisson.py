@@ -35,7 +35,7 @@ from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 from gfnn_jax.models.brackets.search import Data, PoissonLaw, law_of
 from gfnn_jax.models.hamiltonians.fitted_law import Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.phase_space import POISSON, Pairs, require_x64, sizes
+from gfnn_jax.phase_space import POISSON, Pairs, sizes
 from gfnn_jax.search.search import MET
 
 EVEN = 1e-3  # of a sampling interval: what printed times may be off by
@@ -54,7 +54,6 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     FitError where values are missing, states are none of the bracket's, or there is no law (with a
     verdict).
     """
-    require_x64("a fit")
     bracket, tolerance = options.bracket, Tolerance.of(options)
     budget = options.budget(watch, None)
     options.refuse_others(("hamiltonian", "map"), "states with a bracket of their own")
@@ -340,19 +339,10 @@ def _map(piece, bracket: Bracket, data: Data, dt: float, posterior=None) -> Symp
     """The map of a piece, its domain and its parameters those of the data."""
     inner = LOG if isinstance(bracket, Log) else CARTESIAN
     z, beside = data.z0[:, : bracket.size], data.beside
-    domain, angles = covering(_inner(z, bracket)), np.zeros(0)
     given = sampled(beside.names, beside.values, dt, beside.period) if beside.names else None
-    return SymplecticMap(
-        (piece,),
-        inner,
-        domain,
-        sizes(z),
-        angles,
-        dt,
-        parameters=given,
-        posterior=posterior,
-        bracket=bracket,
-    )
+    none = np.zeros(0)  # of angles
+    more: dict[str, Any] = {"parameters": given, "posterior": posterior, "bracket": bracket}
+    return SymplecticMap((piece,), inner, covering(_inner(z, bracket)), sizes(z), none, dt, **more)
 
 
 def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
@@ -363,16 +353,9 @@ def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
     named = zip(names, law.fit.c, std, strict=True)
     every = [Term(name, float(c), float(s)) for name, c, s in named]
     terms = tuple(every[: law.field.library.num_parameters])
-    return LearnedHamiltonian(
-        candidate,
-        map_.pieces[0],
-        terms,
-        formula(terms),
-        float("nan"),
-        messages=tuple(messages),
-        covariance=lambda: law.fit.root,
-        friction=tuple(every[len(terms) :]),
-    )
+    told: dict[str, Any] = {"messages": tuple(messages), "friction": tuple(every[len(terms) :])}
+    told["covariance"] = lambda: law.fit.root
+    return LearnedHamiltonian(candidate, map_.pieces[0], terms, formula(terms), np.nan, **told)
 
 
 def _resistances(law: PoissonLaw) -> list[str]:

@@ -31,7 +31,7 @@ from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit, OfPositions
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.positions import discrete_lagrangian, latent_positions
-from gfnn_jax.phase_space import Pairs, require_x64, sizes
+from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.search.search import MET
 
 
@@ -69,7 +69,6 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     Raises FitError where the recording has no positions at even times, too few triples of them for
     the smallest S, or no S explains them.
     """
-    require_x64("a fit")
     tolerance, structure = Tolerance.of(options), options.structure
     recording, left_out = without_wrong_values(recording)
     budget = options.budget(watch, len(recording.positions) or None)
@@ -79,18 +78,9 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
     if len(triples) < Options.fewest:
         raise FitError(f"expected at least {Options.fewest} triples, got {len(triples)}")
-    sensors = Sensors(
-        recording.positions,
-        (),
-        recording.angles,
-        np.zeros(triples.dim),
-        0.0,
-        Options.window * triples.dt,
-        "hold",
-        0.0,
-        np.array([triples.dt]),
-        np.zeros((1, triples.dim)),
-    )
+    none, window = np.zeros(triples.dim), Options.window * triples.dt
+    read = recording.positions, (), recording.angles, none, 0.0, window
+    sensors = Sensors(*read, "hold", 0.0, np.array([triples.dt]), none[None])
     sweep = _Sweep(triples, sites, _split(triples, options.seed), tolerance, budget, watch, sensors)
     best = sweep.best(symmetric=True)
     if best is None or not tolerance.met_by(best.candidate):

@@ -317,14 +317,8 @@ def checked(
     found = structure_of(structure, pairs.dim, coordinates)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
-    pairs, learn, messages = as_varied(
-        pairs,
-        learn=options.learn,
-        family=options.family,
-        chart=options.chart,
-        base=options.base,
-        structure=structure,
-    )
+    asked = {name: getattr(options, name) for name in ("learn", "family", "chart", "base")}
+    pairs, learn, messages = as_varied(pairs, **asked, structure=structure)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= Options.still:
         raise FitError(

@@ -109,19 +109,8 @@ def _portable(found: Choice | LearnedLaw | LearnedArm | None) -> Any:
         return WithoutMap(type(found).__name__, fields | own)
     law = found.hamiltonian
     if law is not None:
-        law = dataclasses.replace(
-            law,
-            candidate=dataclasses.replace(law.candidate, map=None),
-            covariance=None,
-            kinds=law.which_friction,
-        )
+        bare = dataclasses.replace(law.candidate, map=None)
+        law = dataclasses.replace(law, candidate=bare, covariance=None, kinds=law.which_friction)
         law = law if maps.can_be_saved(law) else None  # a user's functions of z cannot
-    return dataclasses.replace(
-        found,
-        hamiltonian=law,
-        pairs=None,
-        validation_pairs=None,
-        test_pairs=None,
-        scene=None,
-        budget=None,
-    )
+    of_data = ("pairs", "validation_pairs", "test_pairs", "scene", "budget")
+    return dataclasses.replace(found, hamiltonian=law, **dict.fromkeys(of_data))

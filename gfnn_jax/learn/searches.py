@@ -77,15 +77,8 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     climb.climb(most=_SMALL)
     # H with friction that depends on args is not learned.
     lossy_by_args = diagnosis.damping is not None and data.args is not None
-    problem = LawProblem(
-        data,
-        tolerance,
-        budget,
-        scene=scene,
-        terms=options.terms,
-        on_progress=watch.on_progress,
-        partly=request.partly,
-    )
+    told: dict[str, Any] = {"on_progress": watch.on_progress, "partly": request.partly}
+    problem = LawProblem(data, tolerance, budget, scene=scene, terms=options.terms, **told)
     law = None
     if not lossy_by_args:
         dearest = MAX_COST_RATIO * climb.cheapest  # of a law that is chosen beside the maps
@@ -178,15 +171,8 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
     if data.own_dt is not None and not (data.structure is None and data.args is None):
         return []
     if options.family == "mlp":
-        given = (
-            data,
-            tolerance,
-            charts[0],
-            options.max_iterations,
-            options.seed,
-            request.watch.checkpoints,
-        )
-        count = options.ensemble
+        of_training = options.max_iterations, options.seed, request.watch.checkpoints
+        given, count = (data, tolerance, charts[0], *of_training), options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
     return list(
         sweeps_for(options.family, charts, data, tolerance, request.scene, request.watch.factors)
