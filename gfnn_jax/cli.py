@@ -96,7 +96,6 @@ def _check_exists(path: Path) -> None:
 
 
 def _unknown(name: str, known: Sequence[str]) -> InputError:
-    """The error of a name that is neither a file nor one of these."""
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"Did you mean {near[0]}? " if near else ""
     listed = "`gfnn records` and `gfnn scenes` list what comes with the package"
@@ -197,7 +196,6 @@ def _run_file(arguments: argparse.Namespace) -> None:
 
 
 def _show(arguments: argparse.Namespace) -> None:
-    """Open the report where that is asked for and there is one."""
     page = arguments.out / "report.html"
     if arguments.open and page.is_file():
         webbrowser.open(page.resolve().as_uri())
@@ -284,7 +282,6 @@ def _fit(arguments: argparse.Namespace) -> None:
 
 
 def _print_fitted(arguments: argparse.Namespace, ran: Any) -> None:
-    """Print a map that was learned, and what to type next."""
     cli_summary.print_summary(ran, arguments.out)
     _print_next(arguments, " --num-steps 1000 --out prediction.npz")
     _hold_to(arguments.strict, arguments.out)
@@ -334,7 +331,6 @@ def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
 
 
 def _hold_to(strict: bool, model: Path) -> None:
-    """Raise WorkError where ``strict`` is set and the model misses the tolerance."""
     from gfnn_jax.maps.saved import record
 
     if strict and not record(model)["fit"]["tolerance_met"]:
@@ -353,7 +349,6 @@ _OF_FORECAST = ("stop", "estimate_from", "inputs", "compare")
 
 
 def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """Raise InputError where one of these options was given."""
     values = {name: getattr(arguments, name, None) for name in names}
     given = [f"--{n.replace('_', '-')}" for n, v in values.items() if v not in (None, False, ())]
     if given:
@@ -402,7 +397,6 @@ def _is_law(model: Path) -> bool:
 
 
 def _forecast(arguments: argparse.Namespace) -> None:
-    """Forecast from the end of a recording."""
     set_up_jax()
     from gfnn_jax.jobs.forecast import Ahead, forecast_recording
     from gfnn_jax.jobs.output import Output
@@ -480,7 +474,6 @@ def set_up_jax(devices: int | str | None = None) -> None:
 
 
 def _cores() -> int:
-    """Number of processor cores that this process may use."""
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return here or 1
 

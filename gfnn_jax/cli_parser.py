@@ -333,8 +333,6 @@ def fit_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _reader(kind: Kind) -> Callable[[str], Any]:
-    """Make the reader of an option of this kind."""
-
     def read(text: str) -> Any:
         with contextlib.suppress(ValueError):
             if kind.holds(value := kind.read(text)):

@@ -107,8 +107,7 @@ def test_plain_solution_is_numpys(monkeypatch):
 @pytest.mark.parametrize("bytes_per_block", [1, 200_000])  # 256 and 355 rows; neither divides 2,400
 def test_blocks_and_parts_of_the_rows_do_not_matter(monkeypatch, bytes_per_block):
     whole = fitted(FAMILY, *parts(W, NOISY), ONE)
-    options = dataclasses.replace(least_squares.OPTIONS, block_bytes=bytes_per_block)
-    monkeypatch.setattr(least_squares, "OPTIONS", options)
+    monkeypatch.setattr(least_squares.Options, "block_bytes", bytes_per_block)
     (w, target), held = parts(W, NOISY)
     uneven = ((w[i:j], target[i:j]) for i, j in ((0, 7), (7, 7), (7, 450), (450, 600)))
     train = least_squares.reduce(FAMILY, uneven, ONE)
@@ -120,8 +119,7 @@ def test_blocks_and_parts_of_the_rows_do_not_matter(monkeypatch, bytes_per_block
 
 
 def test_a_reduction_can_be_stopped_between_blocks(monkeypatch):
-    options = dataclasses.replace(least_squares.OPTIONS, block_bytes=1)
-    monkeypatch.setattr(least_squares, "OPTIONS", options)
+    monkeypatch.setattr(least_squares.Options, "block_bytes", 1)
     calls = []
 
     def stop():

@@ -408,7 +408,6 @@ _UNITS_OF_TIME |= {"yr": "year", "years": "year", "a": "year", "μs": "us", "utc
 
 
 def _time_unit(name: str, units: Units) -> str | None:
-    """The unit of a column of times, by its header or by its name."""
     words = plain(name).split("_")
     for unit in (_unit(units, name), words[-1], OF_CALENDAR.get(words[0], "")):
         unit = _UNITS_OF_TIME.get(unit, unit)

@@ -308,7 +308,6 @@ def _jumps(traits: Traits, name: str) -> tuple[float, int] | None:
 
 
 def _steps(runs: list[np.ndarray]) -> np.ndarray:
-    """The sizes of the steps between neighbours."""
     return np.abs(np.concatenate([np.diff(x) for x in runs]))
 
 

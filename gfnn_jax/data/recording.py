@@ -406,7 +406,6 @@ class Recording:
         return self._with(_values=values)
 
     def _with(self, **changed: Any) -> Recording:
-        """The same recording with other fields."""
         part = copy.copy(self)
         vars(part).update(changed)
         return part
@@ -476,7 +475,6 @@ def read(
 
 
 def _timed(table: Table, time: str | None) -> Table:
-    """The table with this column of times."""
     if time is None:
         return table
     check_known(table.source, "time", [time], [*table.columns])

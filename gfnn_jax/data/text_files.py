@@ -516,7 +516,6 @@ def _is_number(cell: str, decimal: str = ".") -> bool:
 
 
 def _shown(lines: Sequence[tuple[int, str]]) -> str:
-    """Lines with their numbers, in one line."""
     return "; ".join(f"line {number}: {line.strip()[:60]!r}" for number, line in lines)
 
 

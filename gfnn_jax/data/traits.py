@@ -137,7 +137,6 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
 
 
 def _resolution(recording: Recording, name: str) -> float | None:
-    """The smallest step between the values of a column, as it came."""
     return resolution(np.concatenate(recording.each(recording.values, name)))
 
 

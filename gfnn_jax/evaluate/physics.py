@@ -383,7 +383,6 @@ def _mode(
 
 
 def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
-    """Frequency and Q of the largest swings."""
     a, unit = swings.amplitude[-1], system.units[0]
     at = f"swings of ± {a:.3g} {unit}".rstrip()
     drift = swings.frequency[-1] / swings.frequency[0] - 1

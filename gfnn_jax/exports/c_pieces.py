@@ -183,7 +183,6 @@ def _with_args(tape: Tape, name: str, width: int, more: int) -> tuple[np.ndarray
 
 
 def _explicit(name: str, piece: Any, width: int, more: int) -> list[str]:
-    """Write the step of a piece that solves nothing."""
     tape = Tape()
     z, args = _with_args(tape, "z", width, more)
     image = tape.function(f"{name}_image", {"Z": piece.image(z, args)[0]})

@@ -164,7 +164,6 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequenc
 
 
 def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any], sticks: bool) -> str:
-    """Write the comment at the top of the file, which describes the map and its functions."""
     backwards = (
         ""
         if not sticks
@@ -288,7 +287,6 @@ def about_args(map_: SymplecticMap, name: str) -> str:
 
 
 def _about_inputs(map_: SymplecticMap, name: str) -> str:
-    """Write what the comment says about inputs."""
     signals = map_.signals
     assert signals is not None
     named, count = ", ".join(signals.names), _num_coefficients(signals)

@@ -261,7 +261,6 @@ def _variable(name: str, reference: int, **attributes: Any) -> str:
 def _description(
     graph: LawGraph, map_: SymplecticMap, name: str, token: str, about: Mapping[str, Any]
 ) -> str:
-    """Write modelDescription.xml."""
     width, dim, sensors = len(graph.rates), graph.dim, map_.sensors
     shown = sensors.positions if sensors is not None else graph.names[:dim]
     told = [*shown, *(f"momentum of {q}" for q in shown)]

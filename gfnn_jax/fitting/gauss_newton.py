@@ -201,17 +201,8 @@ class Problem:
         dt, args = self.given(rows)
         along = (options.get("along") or family) if options.get("derivatives") else None
         self.allowance.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
-        return images(
-            family,
-            coefficients,
-            self.z0[rows],
-            dt,
-            steps,
-            args=args,
-            scale=self.scale,
-            on_substep=self.allowance.check,
-            **options,
-        )
+        options |= {"args": args, "scale": self.scale, "on_substep": self.allowance.check}
+        return images(family, coefficients, self.z0[rows], dt, steps, **options)
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
         """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
@@ -381,16 +372,10 @@ class Problem:
         size = np.abs(self.residuals(family, c, steps, rows)).max(axis=1, initial=0.0)
 
         def truncation_error(block) -> np.ndarray:
-            dt, args = self.given(block)
+            (dt, args), scale, check = self.given(block), self.scale, self.allowance.check
+            states = self.z0[block]
             return truncation(
-                family,
-                c,
-                self.z0[block],
-                dt,
-                steps,
-                args=args,
-                scale=self.scale,
-                on_substep=self.allowance.check,
+                family, c, states, dt, steps, args=args, scale=scale, on_substep=check
             )
 
         if row_blocks.devices() and len(rows):

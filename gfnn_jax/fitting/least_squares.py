@@ -14,7 +14,6 @@ Memory for m parameters: one block of rows and the triangle, whatever the number
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -31,7 +30,6 @@ from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.triangle import Triangle
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the solves (benchmarks/constants.py)."""
 
@@ -53,8 +51,6 @@ class Options:
     well_conditioned: float = 1e-13
     well_determined: float = 1.5
 
-
-OPTIONS = Options()
 
 # Rows per term, the fewest that the terms of S are fitted to. Of 70 clean pairs of a pendulum half
 # as many gain two digits by a map that is 1.7 times as dear, and twice as many lose one and a half
@@ -132,7 +128,7 @@ def _on_devices(family: Any, rows, weight, reporting: Callable[[Iterator], Itera
     """The triangle of rows that are shared out among devices."""
     m = family.num_parameters
     on_host = row_blocks.devices()[0].platform == "cpu" or not accelerator_takes(family)
-    least = (OPTIONS.part_on_cpu if on_host else OPTIONS.part_on_accelerators) * (m + 1)
+    least = (Options.part_on_cpu if on_host else Options.part_on_accelerators) * (m + 1)
 
     def of_part(part, device) -> Triangle:
         if on_host:
@@ -163,7 +159,7 @@ def _pairs_of(num_parameters: int, width: int, least: int) -> int:
     """Number of pairs of states (2d,) of this width in a block."""
     return max(
         1,
-        max(OPTIONS.fewest_rows, OPTIONS.block_bytes // (8 * (num_parameters + 1)), least) // width,
+        max(Options.fewest_rows, Options.block_bytes // (8 * (num_parameters + 1)), least) // width,
     )
 
 
@@ -177,8 +173,8 @@ def residuals(train: Triangle, held: Triangle, sizes: Sequence[int]) -> list[tup
     for size in sizes:
         a, b = train.leading(size)
         diagonal = np.abs(np.diagonal(a))
-        well_conditioned = (diagonal > OPTIONS.well_conditioned * np.linalg.norm(a, axis=0)).all()
-        if not well_conditioned or train.rows < OPTIONS.well_determined * size:
+        well_conditioned = (diagonal > Options.well_conditioned * np.linalg.norm(a, axis=0)).all()
+        if not well_conditioned or train.rows < Options.well_determined * size:
             fit = solve(train, held, size)
             found.append((fit.train_rms, fit.validation_rms))
         else:
@@ -204,7 +200,7 @@ def solve(train: Triangle, held: Triangle, num_terms: int) -> LeastSquaresFit:
     errors = held.missed(tried)
     best = int(np.argmin(errors))
     apart = held.image_norm(tried[:, best] - tried[:, 0])
-    by_chance = OPTIONS.certain * 2 * apart * errors[best] / math.sqrt(max(held.rows, 1))
+    by_chance = Options.certain * 2 * apart * errors[best] / math.sqrt(max(held.rows, 1))
     if not errors[0] ** 2 - errors[best] ** 2 > by_chance:
         best = 0
     c, error = tried[:, best], errors[best]

@@ -29,8 +29,7 @@ from gfnn_jax.fitting.triangle import Spectrum, Triangle
 from gfnn_jax.solve.latent_arcs import Fitted
 
 
-@dataclasses.dataclass(frozen=True)
-class LinearisedOptions:
+class Options:
     """Limits of roundoff, relative numbers all; chosen on `benchmarks/measured.py`.
 
     rank: singular value of scaled columns, to the largest, of a combination that is not determined.
@@ -41,9 +40,6 @@ class LinearisedOptions:
     rank: float = 1e-10
     null: float = 1e-9
     part: float = 1e-3
-
-
-OPTIONS = LinearisedOptions()
 
 
 class Added(NamedTuple):
@@ -157,8 +153,8 @@ class Linearised:
         if not len(self.p):
             return np.zeros((0, 0))
         spectrum = self.spectrum
-        along = spectrum.vt[spectrum.s <= OPTIONS.null * spectrum.s[0]]
-        part = np.abs(along) > OPTIONS.part * np.abs(along).max(axis=1, keepdims=True, initial=0)
+        along = spectrum.vt[spectrum.s <= Options.null * spectrum.s[0]]
+        part = np.abs(along) > Options.part * np.abs(along).max(axis=1, keepdims=True, initial=0)
         return np.where(part, along / spectrum.column, 0.0)
 
     def null_direction(self) -> np.ndarray:
@@ -175,7 +171,7 @@ class Linearised:
 
     # Other rows.
 
-    def step(self, rank: float = OPTIONS.rank) -> np.ndarray:
+    def step(self, rank: float = Options.rank) -> np.ndarray:
         """The Gauss–Newton step (n,); 0 along combinations whose singular value, of scaled columns
         and to the largest, is at most ``rank``."""
         size = np.maximum(np.linalg.norm(self.columns, axis=0), 1e-300)
@@ -184,7 +180,7 @@ class Linearised:
     def moved_by(self, other: Linearised) -> float:
         """The most that any combination of coefficients moves, in its standard errors, where the
         residuals are those of ``other``, as by shorter steps of the integrator."""
-        change = other.step(OPTIONS.null) - self.step(OPTIONS.null)
+        change = other.step(Options.null) - self.step(Options.null)
         return float(np.linalg.norm(self.columns @ change) / np.sqrt(self.variance))
 
     # Other columns.

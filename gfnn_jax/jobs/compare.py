@@ -110,13 +110,11 @@ def learn_and_roll(
 
 @partial(jax.jit, static_argnums=0)
 def _jacobians(step, z):
-    """Jacobians (B, 2d, 2d) of a plain step at z (B, 2d)."""
     return jax.vmap(jax.jacfwd(step))(z)
 
 
 @partial(jax.jit, static_argnums=0)
 def _steps(step, z):
-    """Images (B, 2d) of z (B, 2d) under a plain step."""
     return jax.vmap(step)(z)
 
 
@@ -351,7 +349,6 @@ def _curve(error) -> dict[str, Any]:
 
 
 def _already_done(out: Path, job: dict[str, Any], chosen: Sequence[str]) -> bool:
-    """Return whether a resumed comparison had already finished."""
     try:
         found = json.loads((out / report.REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -367,7 +364,6 @@ def _keep(folder: Path, method: str, part: dict[str, Any], rollouts: Rollouts) -
 
 
 def _kept(folder: Path, method: str) -> tuple[dict[str, Any], Rollouts]:
-    """Load what `_keep` has written."""
     part = json.loads((folder / f"{method}.json").read_text(encoding="utf-8"))
     with np.load(folder / f"{method}.npz", allow_pickle=False) as arrays:
         return part, Rollouts(arrays["states"], arrays["status"], float(arrays["seconds"]))

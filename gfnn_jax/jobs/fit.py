@@ -154,7 +154,6 @@ class _Pairs:
 
 
 def _range(values) -> list[float]:
-    """Smallest and largest value."""
     return [float(np.min(values)), float(np.max(values))]
 
 

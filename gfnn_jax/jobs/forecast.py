@@ -137,7 +137,6 @@ class _Model:
         return recording, roles
 
     def _roles(self, channels: tuple[str, ...]) -> dict[str, Any]:
-        """Keywords of `gfnn_jax.read` for a recording with these columns."""
         positions, speeds = self.sensors.positions, self.sensors.observation_model.speeds
         return {
             "positions": tuple(n for n in channels if n in positions),

@@ -89,7 +89,6 @@ def publish(best: Path, model: Path) -> str:
 
 
 def _recorded(model: Path, what: str) -> Any:
-    """A part of a model's record; None where it has none."""
     try:
         return saved.record(model).get(what)
     except InputError:

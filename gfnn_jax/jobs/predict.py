@@ -245,7 +245,6 @@ def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:
 
 
 def _finished(out: Path) -> Predicted:
-    """Read the result of a prediction that is already there."""
     with np.load(out, allow_pickle=False) as done:
         return Predicted(done["status"], done["left_at"], 0.0, done.get("horizon"))
 
@@ -355,7 +354,6 @@ class _Prediction:
 
 
 def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
-    """Arrays from which a prediction can be continued."""
     if of_samples is None:
         return lanes._asdict()
     others = {_OF_SAMPLES + name: value for name, value in of_samples._asdict().items()}

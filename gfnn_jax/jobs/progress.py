@@ -123,7 +123,6 @@ class _Lines:
                 self._message, self._has_status, self._since = self._waits
 
     def _take(self, message: str, has_status: bool) -> None:
-        """Note what is being done, and since when."""
         now = time.perf_counter()
         shown = message + self._left.of(message, now)
         self._since = self._since if shown == self._message else now

@@ -122,7 +122,6 @@ def run(
 
 @jax.jit
 def _keys(seed):
-    """Keys of the pairs and of the test states."""
     of_pairs, of_test = jax.random.split(jax.random.key(seed))
     return of_pairs, of_test
 

@@ -422,7 +422,6 @@ class FitOptions:
 
     @property
     def _of_models(self) -> list[str]:
-        """Names of the options of models that were given."""
         names = dict.fromkeys(name for own in _OF_MODEL.values() for name in own)
         fields = {option.name: option.default for option in dataclasses.fields(self)}
         return [n for n in names if not _same(getattr(self, n), fields[n])]

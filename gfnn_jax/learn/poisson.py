@@ -217,7 +217,6 @@ def pairs_of_states(recording: Recording) -> Pairs:
 
 
 def _data_of(pairs: Pairs) -> Data:
-    """Pairs with runs as the search has them."""
     beside = Beside.of(pairs)
     z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
     z0, z1 = beside.behind(z0), beside.behind(z1, np.asarray(pairs.dt))
@@ -346,7 +345,6 @@ def _map(piece, bracket: Bracket, data: Data, dt: float, posterior=None) -> Symp
 
 
 def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
-    """The law as fits have it."""
     std = np.sqrt(np.sum(law.fit.root**2, axis=0))
     std = np.where(std > 1e-12 * np.abs(law.fit.c), std, 0.0)
     names = (*law.field.library.term_names, *_resistances(law))

@@ -231,7 +231,6 @@ class _Sweep:
         return within(unit, lambda: self._fitted(family, symmetric))
 
     def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
-        """S of this family by least squares."""
         self.watch.on_progress(f"S of {family.label}, {family.num_parameters} terms")
         started, training = time.perf_counter(), self.triples.take(self.split.training)
         solved = discrete_lagrangian.solve(family, training)

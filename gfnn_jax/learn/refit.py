@@ -182,7 +182,6 @@ def refit(
 
 
 def _states_of(parts: Sequence[Pairs]) -> np.ndarray:
-    """The states z0 of all parts, one after the other."""
     return np.concatenate([np.asarray(pairs.z0) for pairs in parts])
 
 
@@ -211,7 +210,6 @@ def help_refit(
 def _with_coefficients(
     law: LearnedHamiltonian, fit: FlowFit, candidate: Candidate
 ) -> LearnedHamiltonian:
-    """The law with the coefficients of this fit."""
     names = [term.term for term in law.terms]
     terms = tuple(map(Term, names, fit.coefficients.tolist(), fit.standard_errors.tolist()))
     flow = dataclasses.replace(law.flow, params=fit.coefficients)
