@@ -19,7 +19,7 @@ import warnings
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from gfnn_jax import cli_summary, processes
 from gfnn_jax.cli_parser import OF_COLUMNS, column_options, fit_options, names_roles, parser
@@ -34,8 +34,14 @@ _TO_BEGIN = "try `gfnn double_pendulum`, or your own `gfnn FILE`; `gfnn --help` 
 
 
 def process() -> int:
-    """Run the command line of this process, and return its exit status."""
-    collect_garbage_seldom()
+    """Run the command line of this process, and return its exit status.
+
+    20,000 new objects, not 700, start a search for reference cycles, and the exit none: imports and
+    traces make millions of objects that live on, and searches among them take half a second of the
+    five of ``gfnn run two-body --quick``.
+    """
+    gc.set_threshold(20_000, 20)
+    atexit.register(gc.freeze)
     return main()
 
 
@@ -52,7 +58,7 @@ def _status_of(argv: Sequence[str]) -> int:
             raise InputError(f"expected a command, got none: {_TO_BEGIN}")
         arguments = parser().parse_args(["run", *argv] if _is_data(argv[0]) else argv)
         arguments.typed = shlex.join(["gfnn", *argv])
-        with stopped_by_sigterm(), warnings_in_one_line():
+        with signals_handled((signal.SIGTERM,), _terminated), warnings_in_one_line():
             _COMMANDS[arguments.command](arguments)
         return 0
     except InputError as error:
@@ -447,14 +453,8 @@ class Terminated(KeyboardInterrupt):
     """Stop by SIGTERM, as clean as one by Ctrl-C."""
 
 
-def collect_garbage_seldom() -> None:
-    """Let 20,000 new objects, not 700, start a search for reference cycles, and none at the exit.
-
-    Imports and traces make millions of objects that live on: searches among them take half a second
-    of the five of ``gfnn run two-body --quick``.
-    """
-    gc.set_threshold(20_000, 20)
-    atexit.register(gc.freeze)
+def _terminated(*_: Any) -> NoReturn:
+    raise Terminated
 
 
 def set_up_jax(devices: int | str | None = None) -> None:
@@ -476,17 +476,6 @@ def set_up_jax(devices: int | str | None = None) -> None:
 def _cores() -> int:
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return here or 1
-
-
-@contextlib.contextmanager
-def stopped_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM stop the work as Ctrl-C does. Nothing is done outside the main thread."""
-
-    def stop(*_):
-        raise Terminated
-
-    with signals_handled((signal.SIGTERM,), stop):
-        yield
 
 
 @contextlib.contextmanager

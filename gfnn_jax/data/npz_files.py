@@ -11,17 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.blocks import (
-    ARC,
-    TIME_TOLERANCE,
-    Block,
-    DataWarning,
-    Request,
-    Source,
-    check_dt,
-    check_width,
-    damage,
-)
+from gfnn_jax.data import blocks
 from gfnn_jax.errors import InputError
 from gfnn_jax.processes import WHOLE, Share
 
@@ -43,7 +33,7 @@ class _StoredArray:
 
     def __init__(self, path: Path, name: str, stream, size: int):
         self.path, self.name, self.stream = path, name, stream
-        with damage(path, name, *_OF_HEADERS):
+        with blocks.damage(path, name, *_OF_HEADERS):
             version = np.lib.format.read_magic(stream)
             if version not in _HEADERS:
                 raise ValueError(f"version {version} of its format is not known")
@@ -59,7 +49,7 @@ class _StoredArray:
             )
 
     def whole(self) -> np.ndarray:
-        with damage(self.path, self.name):
+        with blocks.damage(self.path, self.name):
             data = np.frombuffer(self.stream.read(), self.dtype)
         return data.reshape(self.shape, order="F" if self.fortran_order else "C")
 
@@ -73,7 +63,7 @@ class _StoredArray:
                 yield everything[start : start + rows].astype(np.float64)
             return
         size = width * self.dtype.itemsize
-        with damage(self.path, self.name):
+        with blocks.damage(self.path, self.name):
             self.stream.seek(first * size, os.SEEK_CUR)
             while first < last:
                 count = min(rows, last - first)
@@ -89,7 +79,7 @@ class _Archive:
 
     def __init__(self, path: Path, stream):
         self.path = path
-        with damage(path, "the archive"):
+        with blocks.damage(path, "the archive"):
             self._zip = zipfile.ZipFile(stream)
         self.names = [name[:-4] for name in self._zip.namelist() if name.endswith(".npy")]
 
@@ -97,7 +87,7 @@ class _Archive:
         return name in self.names
 
     def array(self, name: str) -> _StoredArray:
-        with damage(self.path, name):
+        with blocks.damage(self.path, name):
             stream = self._zip.open(f"{name}.npy")
         return _StoredArray(self.path, name, stream, self._zip.getinfo(f"{name}.npy").file_size)
 
@@ -128,7 +118,7 @@ class _Archive:
             raise InputError(f"{self.path}: params not finite, first params[{row}, {column}]")
         names = tuple(f"a{i + 1}" for i in range(values.shape[1]))
         if "param_names" in self:
-            with damage(self.path, "param_names", *_OF_HEADERS), np.load(self.path) as file:
+            with blocks.damage(self.path, "param_names", *_OF_HEADERS), np.load(self.path) as file:
                 names = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
             if len(names) != values.shape[1] or len(set(names)) < len(names):
                 raise InputError(
@@ -155,7 +145,7 @@ class _Sequences(NamedTuple):
     parameters: tuple[tuple[str, ...], np.ndarray | None] = ((), None)
     period: float | None = None
 
-    def source(self) -> Source:
+    def source(self) -> blocks.Source:
         """Raises InputError where shapes do not fit."""
         array, shape, of_pairs = self.arrays[0], self.arrays[0].shape, len(self.arrays) == 2
         if of_pairs:
@@ -167,7 +157,7 @@ class _Sequences(NamedTuple):
         elif len(shape) not in (2, 3) or (self.each_row and len(shape) != 2):
             wanted = "(B, 2d)" if self.each_row else "(L, 2d) or (M, L, 2d)"
             raise InputError(f"{self.path}: {array.name} must have shape {wanted}, found {shape}")
-        dim = check_width(self.path, array.name, shape)
+        dim = blocks.check_width(self.path, array.name, shape)
         if of_pairs or self.each_row:
             count, length = shape[0], 1 + of_pairs
         else:
@@ -194,8 +184,8 @@ class _Sequences(NamedTuple):
             index = (row,) if len(shape) == 2 else divmod(row, length)
             return f"{array.name}[{', '.join(map(str, (*index, column)))}]"
 
-        def blocks(rows: int, share: Share = WHOLE) -> Iterator[Block]:
-            part = share.of(count if of_pairs else count * length, ARC if of_pairs else 1)
+        def read(rows: int, share: Share = WHOLE) -> Iterator[blocks.Block]:
+            part = share.of(count if of_pairs else count * length, blocks.ARC if of_pairs else 1)
             row = part.start * (1 + of_pairs)
             if not of_pairs:  # the pair that begins in the last row ends in the next
                 part = slice(part.start, min(part.stop + 1, count * length))
@@ -207,7 +197,9 @@ class _Sequences(NamedTuple):
                 number = row + np.arange(len(states))
                 sequence, place = np.divmod(number, length)
                 told = None if own is None else own[number]
-                block = Block(states, sequence, place, lambda r, c, n=row: locate(n + r, c), told)
+                block = blocks.Block(
+                    states, sequence, place, lambda r, c, n=row: locate(n + r, c), told
+                )
                 if self.lengths is not None:
                     kept = block.place < self.lengths[block.sequence]
                     block = block.rows(np.flatnonzero(kept))
@@ -218,19 +210,19 @@ class _Sequences(NamedTuple):
         precision = str(
             np.result_type(*(a.dtype for a in self.arrays)) if of_pairs else array.dtype
         )
-        source = Source(dim, self.dt, blocks, precision, parameters=names, uneven=self.uneven)
+        source = blocks.Source(dim, self.dt, read, precision, parameters=names, uneven=self.uneven)
         timed = self.times is not None
         return dataclasses.replace(source, period=self.period, timed=timed, of_pairs_alone=of_pairs)
 
 
-def open_npy(request: Request, stream) -> Source:
+def open_npy(request: blocks.Request, stream) -> blocks.Source:
     """The states of one array: (L, 2d) or (M, L, 2d), or of initial states (B, 2d)."""
     array = _StoredArray(request.path, "the array", stream, request.path.stat().st_size)
     each_row = request.initial and len(array.shape) == 2
     return _Sequences(request.path, (array,), request.agreed_dt(None), each_row).source()
 
 
-def open_npz(request: Request, stream) -> Source:
+def open_npz(request: blocks.Request, stream) -> blocks.Source:
     """Pairs z0 and z1, or trajectories; of initial states z0 alone serves."""
     path, archive = request.path, _Archive(request.path, stream)
     if request.initial and "z0" in archive:
@@ -249,10 +241,10 @@ def open_npz(request: Request, stream) -> Source:
     further = [name for name in archive.names if name not in _READ]
     if further and "job" not in further:  # other arrays of a prediction are about it
         ignored = f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)"
-        warnings.warn(ignored, DataWarning, stacklevel=4)
+        warnings.warn(ignored, blocks.DataWarning, stacklevel=4)
     with_t0, period = "t0" in archive and request.with_times, None
     if "period" in archive and not request.initial:
-        period = check_dt(archive.array("period").whole(), f"{path}: period")
+        period = blocks.check_dt(archive.array("period").whole(), f"{path}: period")
         if not (with_t0 or "times" in archive):
             raise InputError(
                 f"{path}: expected t0, the time of the drive, beside its period; got none"
@@ -268,12 +260,12 @@ def open_npz(request: Request, stream) -> Source:
 
 
 def _pairs(
-    request: Request, archive: _Archive, dt: np.ndarray | None, period: float | None
+    request: blocks.Request, archive: _Archive, dt: np.ndarray | None, period: float | None
 ) -> _Sequences:
     """z0 and z1, the time of the drive at z0 taken modulo its period."""
     path, z0, times = request.path, archive.array("z0"), None
     each = dt is not None and dt.size > 1
-    found = np.nan if each else None if dt is None else check_dt(dt, f"{path}: dt")
+    found = np.nan if each else None if dt is None else blocks.check_dt(dt, f"{path}: dt")
     agreed = request.agreed_dt(found)
     if each:
         assert dt is not None
@@ -295,11 +287,11 @@ def _pairs(
 
 
 def _trajectories(
-    request: Request, archive: _Archive, dt: np.ndarray | None, with_t0: bool
+    request: blocks.Request, archive: _Archive, dt: np.ndarray | None, with_t0: bool
 ) -> _Sequences:
     """trajectories, at steps of dt or at times."""
     path, array = request.path, archive.array("trajectories")
-    found = None if dt is None else check_dt(dt, f"{path}: dt")
+    found = None if dt is None else blocks.check_dt(dt, f"{path}: dt")
     if found is not None and "steps" in archive:
         found *= _stride(path, array.shape, archive.array("steps").whole())
     lengths = archive.array("lengths").whole() if "lengths" in archive else None
@@ -341,7 +333,7 @@ def _times_dt(path, times, shape, lengths) -> float:
             f"{times[m, i]:g}"
         )
     usual = float(np.median(steps[used])) if used.any() else np.nan
-    slack = TIME_TOLERANCE * usual + 4 * np.finfo(np.float64).eps * np.abs(times[:, 1:])
+    slack = blocks.TIME_TOLERANCE * usual + 4 * np.finfo(np.float64).eps * np.abs(times[:, 1:])
     even = bool((np.abs(steps - usual) <= slack)[used].all())
     return float(np.mean(steps[used])) if even else np.nan
 

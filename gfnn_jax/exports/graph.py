@@ -19,17 +19,9 @@ from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_pieces import on_symbols, why_not_piece
 from gfnn_jax.exports.symbols import Symbol, Tape
+from gfnn_jax.families import friction
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
-from gfnn_jax.families.friction import (
-    ISOTROPIC,
-    ONE_SIDED,
-    POWER,
-    QUADRATIC,
-    STRIBECK,
-    TABLE,
-    Friction,
-)
 from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
@@ -82,16 +74,16 @@ class LawGraph:
         return sum(map(len, self.series))
 
 
-def _pulls(own: Friction, v: np.ndarray, signs: np.ndarray) -> np.ndarray:
+def _pulls(own: friction.Friction, v: np.ndarray, signs: np.ndarray) -> np.ndarray:
     """∂r_k/∂v (F, d) at v (d,) on symbols: the signs of speeds are given, 0 of friction that needs
     none. |v| of isotropic friction is that of speeds above 1e-8: it has no series at 0."""
     pulls = []
     for c, kind, width, sign in zip(own.directions, own.kinds, own.widths, signs, strict=True):
-        if kind == ISOTROPIC:
+        if kind == friction.ISOTROPIC:
             size = (c @ (v * v) + 1e-16).sqrt()
             pulls.append(c * v * size ** (float(width) - 1))
         else:
-            pulls.append(c * TABLE[kind].signed(c @ v, sign, width))
+            pulls.append(c * friction.TABLE[kind].signed(c @ v, sign, width))
     return np.array(pulls, dtype=object)
 
 
@@ -183,8 +175,8 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
             "and is in no format yet: forecast it here (gfnn predict)"
         )
     sharp = own.dry & (own.widths <= creep)
-    kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED, STRIBECK))
-    kinked |= (own.kinds == POWER) & (own.widths % 2 != 1)  # odd powers are smooth
+    kinked = np.isin(own.kinds, (friction.QUADRATIC, friction.ONE_SIDED, friction.STRIBECK))
+    kinked |= (own.kinds == friction.POWER) & (own.widths % 2 != 1)  # odd powers are smooth
     signed = np.flatnonzero(sharp | kinked)
     signs = np.zeros(own.count, dtype=object)
     signs[signed] = tape.inputs("sigma", len(signed))[0] if len(signed) else []

@@ -8,8 +8,6 @@ is even in the displacement makes S(q, Q) = S(Q, q): the S of a reversible map, 
 way back where momenta are turned.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ that a term a user gives is data. A Python function becomes the same tree in `tr
 derivatives are computed in `jets`.
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import keyword

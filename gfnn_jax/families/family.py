@@ -6,8 +6,6 @@ static. The same lines compute in NumPy for NumPy arrays (a fit) and are traced 
 (a step).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """Functions that a formula may contain, by name, with their first two derivatives."""
 
-from __future__ import annotations
-
 import keyword
 import re
 from collections.abc import Callable

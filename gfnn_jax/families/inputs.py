@@ -1,7 +1,5 @@
 """Variables of a family: the entries of w or the features that a scene declares, scaled."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -3,8 +3,6 @@
 The same lines compute in NumPy and are traced by JAX.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import operator

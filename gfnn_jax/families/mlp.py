@@ -6,8 +6,6 @@ N_θ has unit size in any units of the data: ``Inputs`` scales its input and s i
 scaling inside S leaves the map symplectic.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
@@ -28,13 +26,8 @@ PAPER_HIDDEN = (200, 100, 50, 20)
 PAPER_HIDDEN_STANDARD_MAP = (500, 500, 200, 20)
 
 # ∇S is what is fitted and its own derivative is what is solved with: S must be smooth.
-ACTIVATIONS: dict[str, Callable] = {
-    "tanh": jnp.tanh,
-    "sin": jnp.sin,
-    "softplus": jax.nn.softplus,
-    "silu": jax.nn.silu,
-    "gelu": jax.nn.gelu,
-}
+ACTIVATIONS: dict[str, Callable] = {"tanh": jnp.tanh, "sin": jnp.sin}
+ACTIVATIONS |= {"softplus": jax.nn.softplus, "silu": jax.nn.silu, "gelu": jax.nn.gelu}
 
 
 @pytree("hidden", "activation")

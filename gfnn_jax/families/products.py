@@ -9,8 +9,6 @@ derivatives come from recurrences and from two dense matrix products of about (â
 batch: many times faster than differentiating a thousand terms.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from functools import cache, cached_property, reduce

@@ -10,8 +10,6 @@ stands for gravity. A link's frame is that of its joint, turned or moved by it. 
 first, and runs in NumPy or JAX.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -6,8 +6,6 @@
 fit is one least-squares solve; the number of features does not grow with the dimension.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -6,8 +6,6 @@ q(k) and p(k) are the k-th position and momentum. On a ring an index goes on beh
 ``Mod``; fixed ends are q(0) = q(d + 1) = 0, p as well.
 """
 
-from __future__ import annotations
-
 import ast
 import copy
 import re

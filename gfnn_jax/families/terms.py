@@ -194,13 +194,9 @@ class Terms(OfCoefficients):
         shape = len(self.powers), len(self.variables)
         kept = np.array(self.powers, dtype=int).reshape(shape)[list(rows)]
         used = np.flatnonzero(kept.any(axis=0)) if len(kept) else np.arange(0)
-        return Terms(
-            self.dim,
-            tuple(self.variables[k] for k in used),
-            tuple(tuple(row) for row in kept[:, used].tolist()),
-            self.parameters,
-            self.names,
-        )
+        variables = tuple(self.variables[k] for k in used)
+        powers = tuple(tuple(row) for row in kept[:, used].tolist())
+        return Terms(self.dim, variables, powers, self.parameters, self.names)
 
     def value(self, params, w, args=None):
         """Value of f, shape (...): params (N,), w (..., 2d)."""

@@ -3,8 +3,6 @@
 Code is what ``--terms``, `families.expressions.parse` and sympy read.
 """
 
-from __future__ import annotations
-
 import keyword
 import re
 from collections.abc import Iterable, Sequence

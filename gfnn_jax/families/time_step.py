@@ -5,8 +5,6 @@ have the same w, so that the displacement h Jâˆ‡S is odd in h and S is even. dtÂ
 variable beside the coordinates, in which S is not differentiated.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

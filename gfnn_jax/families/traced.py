@@ -1,7 +1,5 @@
 """Python functions of a state as expressions: JAX traces them once, their jaxpr runs on trees."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -6,8 +6,6 @@ An epoch is one compiled scan. Its order of the pairs is a function of the key a
 number alone: the same key gives the same bits.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

@@ -12,8 +12,6 @@ parameter at once (`solve`).
 Memory for m parameters: one block of rows and the triangle, whatever the number of pairs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple

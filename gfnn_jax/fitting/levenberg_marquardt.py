@@ -77,13 +77,8 @@ class LMState(NamedTuple):
     def after(self, theta, damping, train_rms: float, validation_rms: float) -> LMState:
         """The state after a step to θ."""
         theta, iteration = np.asarray(theta), self.iteration + 1
-        found = self._replace(
-            theta=theta,
-            damping=damping,
-            iteration=iteration,
-            train_rms=train_rms,
-            validation_rms=validation_rms,
-        )
+        errors = {"train_rms": train_rms, "validation_rms": validation_rms}
+        found = self._replace(theta=theta, damping=damping, iteration=iteration, **errors)
         if validation_rms < self.best_validation_rms:
             found = found._replace(best_theta=theta, best_validation_rms=validation_rms)
         if train_rms < 0.99 * self.landmark_rms:

@@ -15,8 +15,6 @@ one looks like a short one.
 *Linear starts* of a fit of H through its flow: midpoint, logarithm, forward logarithm.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import combinations_with_replacement
 

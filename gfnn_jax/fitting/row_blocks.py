@@ -8,8 +8,6 @@ Each device has a thread. That of a CPU's device does the arithmetic itself, by 
 which let other threads work beside them; that of an accelerator hands it over.
 """
 
-from __future__ import annotations
-
 import contextlib
 import queue
 from collections import deque

@@ -1,7 +1,5 @@
 """Terms that the pairs tell apart, and tell from noise."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
 

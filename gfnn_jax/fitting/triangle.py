@@ -253,20 +253,8 @@ def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) ->
         numbers.ctypes.data + i * numbers.itemsize for i in range(len(numbers))
     )
     table, work = np.empty((panel, n), order="F"), np.empty(panel * n)
-    _tpqrt()(
-        rows_,
-        columns,
-        zeros,
-        panel_,
-        factor.ctypes.data,
-        of_factor,
-        rows.ctypes.data,
-        of_rows,
-        table.ctypes.data,
-        of_table,
-        work.ctypes.data,
-        status,
-    )
+    a, b, t, w = (array.ctypes.data for array in (factor, rows, table, work))
+    _tpqrt()(rows_, columns, zeros, panel_, a, of_factor, b, of_rows, t, of_table, w, status)
     if numbers[-1]:
         raise ValueError(f"LAPACK's dtpqrt refuses its argument {-numbers[-1]}")
     return factor

@@ -15,8 +15,6 @@ What the terms cannot represent is not independent: it stays, however many pairs
 ``rows`` such residuals only as many count as there are terms, each in its own part of phase space.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import gammainc
 

@@ -4,8 +4,6 @@ Stage by stage, K_i = J∇H(z + h Σ_j a_ij K_j, t + c_i h), then Z = z + h Σ_i
 stages have shape (s, B, 2d): a sum over stages is then one matrix product.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple

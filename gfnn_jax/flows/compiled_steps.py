@@ -721,14 +721,9 @@ class Stepper:
     def steps(self, lanes: tuple[np.ndarray, np.ndarray], count: int, args: Any) -> Task:
         """Follow lanes by ``count`` steps. args: (N or 1, M or 1, k) as each begins, or None."""
         num, angles = len(lanes[0]), len(self.law.angles)
-        task = Task(
-            *lanes,
-            self._given(args),
-            np.full((num, count, *lanes[0].shape[1:]), np.nan),
-            np.zeros((num, count, angles)),
-            np.zeros(num, np.int64),
-            np.zeros(num, np.int64),
-        )
+        states = np.full((num, count, *lanes[0].shape[1:]), np.nan)
+        turns, ends = np.zeros((num, count, angles)), (np.zeros(num, np.int64) for _ in range(2))
+        task = Task(*lanes, self._given(args), states, turns, *ends)
         sizes = self.flow.substeps, *self.sizes, self.flow.stages
         roll(self.law, task, Room.of(self.law, num), sizes)
         return task

@@ -1,8 +1,6 @@
 """The method of Dormand and Prince (J. Comput. Appl. Math. 6 (1980) 19): its solution of order
 5."""
 
-from __future__ import annotations
-
 import numpy as np
 
 NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])

@@ -9,8 +9,6 @@ An input is a polynomial in time over each step: its value at the step's begin a
 of τ, τ², … stand among the args, and `families.family.at_time` moves them to a stage's time.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from math import comb
 from typing import Any

@@ -2,8 +2,6 @@
 Hamiltonian and symmetric in time (Hairer, Lubich & Wanner, "Geometric Numerical Integration",
 sections II.1 and VI.4)."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

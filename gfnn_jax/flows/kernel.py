@@ -35,8 +35,6 @@ Whole numbers of a law stand in rows of one array n; all its other numbers, and 
 one lane, in rows of another, f.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

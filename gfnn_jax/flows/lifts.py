@@ -13,8 +13,6 @@ of z (R. I. McLachlan, K. Modin & O. Verdier, "Collective symplectic integrators
 - a constant bracket is its own lift, and a log-canonical one that of y = log z.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

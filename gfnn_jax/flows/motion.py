@@ -170,16 +170,10 @@ class Form:
         asked = ((len(h), width), (len(h), frictions), h.shape, (self.num_inputs,))
         if lanes != asked or not all(len(rows) in (1, len(h)) for rows in laws):
             raise ValueError(f"expected states, modes, steps and inputs {asked}, got {lanes}")
-        task = kernel.Task(
-            _owned(x),
-            _owned(begun),
-            _owned(h),
-            _owned(u),
-            np.empty((*h.shape, width)),
-            np.empty((*h.shape, width, columns)),
-            np.empty((*h.shape, frictions)),
-            np.empty(len(x), np.int64),
-        )
+        given = _owned(x), _owned(begun), _owned(h), _owned(u)
+        states, by = np.empty((*h.shape, width)), np.empty((*h.shape, width, columns))
+        after, status = np.empty((*h.shape, frictions)), np.empty(len(x), np.int64)
+        task = kernel.Task(*given, states, by, after, status)
         tables = self._tables
         kernel.follow(tables.whole, tables.room(columns), laws, task, order)
         by = task.by

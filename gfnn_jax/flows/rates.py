@@ -1,7 +1,5 @@
 """Fastest rates of a Hamiltonian's linearised flow, and the substeps that they ask for."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfnn_jax.families.family import form_of

@@ -1,8 +1,6 @@
 """Inputs between their samples: held, linear, or band-limited, at the nodes of the Runge–Kutta
 steps; and inputs that act later than they were measured."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sines and cosines in compiled loops, of several numbers at once."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ The first of the args are the parameters μ, and each coefficient c_j of H and o
 c_j ∏ μ_i^n_ji: the law of a pendulum of any length, of a cart with any mass on it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from gfnn_jax.arrays import as_row, beside, pytree

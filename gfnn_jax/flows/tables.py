@@ -119,16 +119,9 @@ class Tables(NamedTuple):
         whole = np.zeros((row.COORDINATES + 3 * most, longest), np.int64)
         for k, values in by_rows.items():
             whole[k, : len(values)] = values
-        counts = {
-            row.DIM: d,
-            row.TERMS: count,
-            row.NUM_WAVES: len(waves) - 1,
-            row.FRICTIONS: len(kinds),
-            row.COULOMBS: np.sum(kinds == row.COULOMB),
-            row.INPUTS: num_inputs,
-            row.FREE_TERMS: basis.shape[1],
-            row.MOST: most,
-        }
+        counts = {row.DIM: d, row.TERMS: count, row.INPUTS: num_inputs, row.MOST: most}
+        counts |= {row.NUM_WAVES: len(waves) - 1, row.FREE_TERMS: basis.shape[1]}
+        counts |= {row.FRICTIONS: len(kinds), row.COULOMBS: np.sum(kinds == row.COULOMB)}
         jet = 1 + most + most**2 if code else 0
         lengths = (*[d] * 8, *[2 * d] * 3, 12 * d, *[len(kinds)] * 5, most, most**2, jet)
         places = np.cumsum([row.BLOCKS, *lengths])
@@ -137,12 +130,8 @@ class Tables(NamedTuple):
         directions = places[row.DIRECTIONS - row.MASSES] + np.arange(d)
         operands = np.array([operand for _, operand in code])
         stack = np.zeros(_depth(code))
-        parts = (
-            (row.PARTS, basis[at, columns]),
-            (row.WIDTHS, friction.widths),
-            (row.OPERANDS, operands),
-            (row.STACK, stack),
-        )
+        parts = (row.PARTS, basis[at, columns]), (row.WIDTHS, friction.widths)
+        parts += (row.OPERANDS, operands), (row.STACK, stack)
         columns_of = zip(directions.tolist(), friction.directions.T.astype(float), strict=True)
         stages = zip(range(row.STAGES, row.NODES), STAGES, strict=True)
         tableau = (*stages, (row.NODES, NODES), (row.WEIGHTS, WEIGHTS))

@@ -13,8 +13,6 @@ optimised once, for this processor, and kept on disk by what it was made from. n
 with all of Python, for ten times the seconds. This module alone imports llvmlite.
 """
 
-from __future__ import annotations
-
 import ast
 import ctypes
 import hashlib

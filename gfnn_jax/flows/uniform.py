@@ -9,8 +9,6 @@ order 2s; back in p its derivative A obeys AᵀJA = e^(−γh) J to roundoff at 
 lost at the rate 2γT, whatever M(q) is: Rayleigh's R = γT.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -15,8 +15,6 @@ the unknowns are the entries of w that the state z does not give; ``residual`` v
 solution. States, points and gradients have shape (..., 2d), NumPy or JAX; dt is a number.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -84,10 +84,10 @@ def learn_and_roll(
         learned = chosen.learn(sequences, budget)
         budget.on_progress("rollouts")
         model = "map", method, learned.label, None, learned.num_parameters
-        jacobians = np.asarray(_jacobians(learned.step, z[:_NUM_DEFECTS]))
-        defect = float(symplecticity_defect(jacobians, sizes(z)).max())
+        jacobians = jax.jit(jax.vmap(jax.jacfwd(learned.step)))(z[:_NUM_DEFECTS])
+        defect = float(symplecticity_defect(np.asarray(jacobians), sizes(z)).max())
         about = {**_NO_MAP, "symplecticity_defect": defect}
-        images, roll = _steps(learned.step, z), partial(step_rollouts, learned.step)
+        images, roll = jax.jit(jax.vmap(learned.step))(z), partial(step_rollouts, learned.step)
     training = learned.training
     part = {
         "model": dict(zip(_MODEL, model, strict=True)),
@@ -106,16 +106,6 @@ def learn_and_roll(
         "map": about,
     }
     return part, roll(data.z0, NUM_STEPS)
-
-
-@partial(jax.jit, static_argnums=0)
-def _jacobians(step, z):
-    return jax.vmap(jax.jacfwd(step))(z)
-
-
-@partial(jax.jit, static_argnums=0)
-def _steps(step, z):
-    return jax.vmap(step)(z)
 
 
 def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollouts]:

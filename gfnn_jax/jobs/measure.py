@@ -54,16 +54,11 @@ def map_rollouts(
 
 def step_rollouts(step: Callable, z0, num_steps: int = NUM_STEPS) -> Rollouts:
     """Roll out a plain ``step(z)`` -> Z of one state (2d,) from z0 (B, 2d)."""
-    z0 = np.asarray(z0)
-    states, seconds = _timed(_rolled_out.lower(step, z0, num_steps).compile(), z0)
+    z0, rolled_out = np.asarray(z0), jax.jit(rollout, static_argnums=(0, 2))
+    states, seconds = _timed(rolled_out.lower(step, z0, num_steps).compile(), z0)
     states = np.asarray(states)
     finite = np.isfinite(states).all(axis=(1, 2))
     return Rollouts(states, np.where(finite, OK, NON_FINITE), seconds)
-
-
-@partial(jax.jit, static_argnums=(0, 2))
-def _rolled_out(step, z0, num_steps):
-    return rollout(step, z0, num_steps)
 
 
 def _timed(call: Callable, *arguments: Any) -> tuple[Any, float]:

@@ -62,11 +62,6 @@ def _are(test: Callable[[Any], bool], *kinds: type) -> Callable[[Any], bool]:
     return lambda values: isinstance(values, kinds) and all(test(value) for value in values)
 
 
-def _same(value: Any, default: Any) -> bool:
-    """Return whether an option has its default, or nothing where the default is nothing."""
-    return value is default or (not default and not value) or value == default
-
-
 POSITIVE = Kind("a finite number > 0", _is_positive, float)
 COUNT, SEED = _whole(1, 53), _whole(0, 32)
 DEVICES = Kind(
@@ -424,7 +419,13 @@ class FitOptions:
     def _of_models(self) -> list[str]:
         names = dict.fromkeys(name for own in _OF_MODEL.values() for name in own)
         fields = {option.name: option.default for option in dataclasses.fields(self)}
-        return [n for n in names if not _same(getattr(self, n), fields[n])]
+        values = ((name, getattr(self, name), fields[name]) for name in names)
+        # An option has its default, or nothing where the default is nothing.
+        return [
+            n
+            for n, v, default in values
+            if not (v is default or not (default or v) or v == default)
+        ]
 
     def refuse_others(
         self, learns: Sequence[str], of_what: str, error: type[ValueError] = FitError
