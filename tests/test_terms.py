@@ -11,7 +11,7 @@ import sympy
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
 from gfnn_jax.families.expressions import parse, to_text
-from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.modes import modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.families.text import Term, plain
 from gfnn_jax.families.traced import traced
@@ -22,10 +22,9 @@ from gfnn_jax.scenes.systems import pcr3bp_features as features
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(0.3, 0.9, (5, 2, 4))
-MODES = Modes(2, (0, 1), ("p1", "p2", "1/(2 + cos(q1))"), 1)
 FAMILIES = {
     "polynomials": polynomial_terms(2, 4),
-    "modes": MODES.terms(MODES.box(1, 1)),
+    "modes": modes(2, (0, 1), ("p1", "p2", "1/(2 + cos(q1))"), 1, 1),
     "features": polynomial_terms(2, 2, features=features),
     "given": given_terms(
         2, ["1/(1 + sin(q1 - q2)**2)", "exp(-q1**2)*tanh(p2)", "log(q1**2 + 1)/sqrt(p1**2 + 2)"]

@@ -51,7 +51,7 @@ class Evidence:
     log_odds: float = 20.0
     logarithm: float = 10.0
     rise: float = 1.1
-    roundoff: float = 5e-15
+    roundoff: float = 1e-14
 
     @property
     def deciding(self) -> float:

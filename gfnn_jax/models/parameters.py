@@ -19,7 +19,7 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.expressions import coordinate_names
-from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.modes import modes
 from gfnn_jax.families.terms import Terms, joined, multiplied, polynomial_terms
 from gfnn_jax.phase_space import TIME
 
@@ -71,11 +71,10 @@ def states_and_functions(
     dim, parameters = data.dim, data.parameters
     angles, plain = angles_and_others(data)
     if angles and features is None:
-        basis = Modes(dim, angles, plain)
         # A torque that the args say, −∂H/∂θ of θ f(args), is one for all turns of θ.
         names = tuple(coordinate_names(dim)[i] for i in angles)
         turned = Terms(dim, names, tuple(map(tuple, np.eye(len(names), dtype=int).tolist())))
-        found = [joined(basis.terms(basis.box(*size)), turned) for size in OPTIONS.boxes]
+        found = [joined(modes(dim, angles, plain, *box), turned) for box in OPTIONS.boxes]
     else:
         degrees = OPTIONS.polynomials if features is None else OPTIONS.features
         cyclic = data.coordinates.cyclic

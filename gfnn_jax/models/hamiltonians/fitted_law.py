@@ -94,14 +94,13 @@ class FittedLaw(NamedTuple):
 
     rows: that the fit was given; it has left out those that the flow does not resolve. null: terms
     that the pairs do not tell from the others.
-    undetermined: of the null terms, those that other states would tell from the rest. ended: why a
-    library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
-    whether their errors were the same, which is that of the pairs; larger: the largest
-    of those. thresholds: standard errors below which its terms go, in turn; None: as of the
-    options. dropped: terms that went in the end. whole:
-    what whole sequences tell, where they were fitted. constants: numbers inside terms that were
-    fitted with them. symmetries, rivals: as of `LearnedHamiltonian`. odds: of the kinds
-    of its friction against others, where these competed."""
+    undetermined: of the null terms, those that other states would tell from the rest. stalled:
+    whether larger libraries were no better. noisy: whether their errors were the same, which is
+    that of the pairs; larger: the largest of those. thresholds: standard errors below which its
+    terms go, in turn; None: as of the options. dropped: terms that went in the end. whole: what
+    whole sequences tell, where they were fitted. constants: numbers inside terms that were fitted
+    with them. symmetries, rivals: as of `LearnedHamiltonian`. odds: of the kinds of its friction
+    against others, where these competed."""
 
     family: Any  # of terms of H, or of L, with friction or without
     fit: FlowFit
@@ -109,7 +108,6 @@ class FittedLaw(NamedTuple):
     error: OneStepError
     null: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
-    ended: str = ""
     stalled: bool = False
     noisy: bool = False
     larger: FittedLaw | None = None

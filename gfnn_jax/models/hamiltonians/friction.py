@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,6 @@ from gfnn_jax.flows.uniform import Uniform, without_forces
 from gfnn_jax.maps import laws
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
-from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.lagrangians.friction_choice import (
     FrictionChoice,
@@ -61,16 +60,14 @@ class FrictionOptions:
 
     gained: of the held-out error of H alone, what friction must lower it to. alike: of what uniform
     friction leaves over, what rates of their own must lower it to. looked_at: pairs that tell
-    whether friction explains anything, and limits. boxes: (order, degree) of the modes of angles
-    that are tried. sharp: ε of dry friction in a fit, in rms speeds: of pairs in which none turns,
-    roundoff. turning: of its rms, a speed at which a step is taken to turn. rounded: of the scale,
-    residuals below it do not tell kinds apart.
+    whether friction explains anything, and limits. sharp: ε of dry friction in a fit, in rms
+    speeds: of pairs in which none turns, roundoff. turning: of its rms, a speed at which a step is
+    taken to turn. rounded: of the scale, residuals below it do not tell kinds apart.
     """
 
     gained: float = 0.5
     alike: float = 0.7
     looked_at: int = 600
-    boxes: tuple[tuple[int, int], ...] = ((1, 1), (1, 2), (2, 2))
     sharp: float = 1e-9
     turning: float = 0.05
     rounded: float = 1e-12
@@ -172,18 +169,6 @@ def mechanical(problem: LawProblem) -> FittedLaw | None:
         return found
 
     return beside_friction(problem, alone, search)
-
-
-def libraries_with(forces: Forces, problem: LawProblem) -> Iterator[Any]:
-    """The families of H by rising size, each with these forces; of angles their shortest modes."""
-    basis = modes_of(problem)
-    if basis is None:
-        yield from map(forces, libraries_of(problem))
-        return
-    for size in OPTIONS.boxes:
-        family = basis.terms(basis.box(*size))
-        if family.num_parameters < problem.most_terms:
-            yield forces(family)
 
 
 def _certain(law: FittedLaw) -> bool:

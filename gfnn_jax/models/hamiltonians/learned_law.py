@@ -282,8 +282,6 @@ def _unmet(tolerance: Tolerance, found: FittedLaw, law: LearnedHamiltonian) -> s
         )
     elif not is_smooth(found.family):
         why = TURNS.capitalize()
-    elif found.ended:
-        why = f"The search for modes ended: {found.ended}"
     return (
         "no H of the terms tried meets the tolerance: the best has a one-step error of "
         f"{law.candidate.validation_relative:.2e} of the spread. {why}"

@@ -12,31 +12,15 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.residuals import misfit
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import parse, to_text
-from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.modes import modes
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
-from gfnn_jax.families.told import Constrained, Told, anything_told, told_of, untold
+from gfnn_jax.families.told import Constrained, Told, told_of, untold
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
 from gfnn_jax.models.parameters import angles_and_others
-
-
-def modes_of(problem: LawProblem) -> Modes | None:
-    """The basis that grows, where an angle enters H by itself, beside a user's terms; else None,
-    and where something is told of their coefficients."""
-    data, scene, terms = problem.data, problem.scene, problem.terms
-    if data.args is not None or (scene is not None and scene.features is not None):
-        return None
-    if anything_told(terms):
-        return None
-    angles, plain = angles_and_others(data)
-    if not angles:
-        return None
-    own = given_terms(data.dim, terms).variables if terms else ()
-    own = tuple(text for text in own if text not in plain)
-    return Modes(data.dim, angles, (*plain, *own), len(own))
 
 
 def own_terms(problem: LawProblem) -> Terms | None:
@@ -65,29 +49,32 @@ def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums | Constrained]:
         libraries = data.structure.libraries(data.dim, problem.terms)
         yield from (f for f in libraries if f.num_parameters <= problem.most_terms)
         return
-    reversor = scene.reversor if scene is not None else None
-    features = scene.features if scene is not None else None
-    most, own = min(problem.most_terms, options.most_terms), own_terms(problem)
-    degrees = options.degrees if features is None else options.feature_degrees
-    for degree in degrees if own is None else options.given_degrees:
-        if degree == 0:
-            assert own is not None
-            yield constrained(problem, own)
-            continue
-        family = polynomial_terms(
-            data.dim,
-            degree,
-            cyclic=data.coordinates.cyclic,
-            features=features,
-            reversor=reversor,
-        )
-        tried = [family] if own is None else [joined(own, family)]
-        if own is not None and degree in options.given_products:
-            tried.append(joined(tried[0], multiplied(own, family)))
-        for library in tried:
-            if library.num_parameters > most:
-                return
-            yield library if own is None else constrained(problem, library)
+    most, own = options.most_terms, own_terms(problem)
+    if problem.of_modes:
+        most, of_data = options.most_modes, (data.dim, *angles_and_others(data))
+        boxes = options.boxes if own is None else options.given_boxes
+        families = (modes(*of_data, *box) for box in boxes)
+    else:
+        features, reversor = (None, None) if scene is None else (scene.features, scene.reversor)
+        degrees = options.degrees if features is None else options.feature_degrees
+        degrees = degrees if own is None else options.given_degrees
+        given = {"cyclic": data.coordinates.cyclic, "features": features, "reversor": reversor}
+        families = (polynomial_terms(data.dim, degree, **given) for degree in degrees)
+    if own is not None:
+        families = _beside(own, families)
+    for library in families:
+        if library.num_parameters > min(problem.most_terms, most):
+            return
+        yield library if own is None else constrained(problem, library)
+
+
+def _beside(own: Terms, families: Iterator[Terms]) -> Iterator[Terms]:
+    """A user's terms alone, beside each family, and times those of the first one too."""
+    yield own
+    for n, family in enumerate(families):
+        yield joined(own, family)
+        if n == 0:
+            yield joined(joined(own, family), multiplied(own, family))
 
 
 def promising(libraries: list[Any], data: Dataset) -> list[Any]:

@@ -21,6 +21,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.rates import MOST_SUBSTEPS, rates
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, OnPartial
+from gfnn_jax.models.parameters import angles_and_others
 from gfnn_jax.phase_space import symplectic_form
 
 
@@ -28,32 +29,30 @@ from gfnn_jax.phase_space import symplectic_form
 class LawOptions:
     """Tuned on Hénon–Heiles at dt 0.5 to 3, on three bodies and on the double pendulum.
 
-    degrees: of the products of coordinates; feature_degrees: of a scene's features; given_degrees:
-    of the products that stand beside a user's own terms (0: his alone), given_products: by which
-    his terms are multiplied too.
-    most_terms: of a library; most_modes: of one that grows. rows_per_term: that a library needs;
-    rows_per_lagrangian_term: pairs times degrees of freedom that one of L needs.
+    degrees: of the products of coordinates; boxes: (order, degree) of modes, where there are
+    angles; feature_degrees: of a scene's features; given_degrees, given_boxes: of what stands
+    beside a user's own terms. most_terms: of a library; most_modes: of one of modes. rows_per_term:
+    that a library needs; rows_per_lagrangian_term: pairs times degrees of freedom that one of L
+    needs.
     rows_compared: per term, on which libraries are compared; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     flat: libraries one after the other whose errors differ by less have met the pairs' noise.
-    gained: a library that lowers the error by less has not helped; gained_alone: where
-    noise hides what it brings. poor: such libraries in a row
-    that end the search; poor_given: of a user's terms; poor_structured: of a structure, whose
-    libraries differ in kind. hopeless: times the tolerance, of an error that is known before a
-    library is fitted, by an affine map of affine_rows training pairs. small: terms of the libraries
-    that are tried before laws of physics, 0.3 s of two bodies; exact: of the spread, what a
-    polynomial errs by that is no approximation. on_branch: of the spread, an error below which is
-    that of the right branch of the turns, which turning pairs tell.
-    truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
-    as a part of the tolerance. generators: degrees of those that look for misfit, beside the one
-    that is so far ``beyond`` the law's own: an even H lacks no odd terms; sampled_rows: per term,
-    where what is left over is looked at, fewest_sampled: pairs at least, of many sites numbers;
-    white_pairs: whose residuals say whether a law leaves anything but noise. max_operations: of the
-    flows that are evaluated on the
-    way, counted: what a quiet core makes in half a minute, at 5e8 a second (two bodies, three
-    bodies, pendulums), within which all laws of the benchmarks are found that are found at all;
-    mode_operations: the same where modes grow, a minute at 7e8 a second; growth_part: the part of
-    them in which they may; first_round: operations that the first round is expected to take.
+    gained: a library that lowers the error by less has not helped; gained_alone: where noise hides
+    what it brings. poor: such libraries in a row that end the search; poor_given: of a user's
+    terms; poor_in_kind: of a structure or of modes, whose libraries differ in kind. hopeless:
+    times the tolerance, of an error that is known before a library is fitted, by an affine map of
+    affine_rows training pairs. small: terms of the libraries that are tried before laws of physics,
+    0.3 s of two bodies; exact: of the spread, what a polynomial errs by that is no approximation.
+    on_branch: of the spread, an error below which is that of the right branch of the turns, which
+    turning pairs tell. truncation: a flow's own error, as a part of the tolerance. generators:
+    degrees of those that look for misfit, beside the one that is so far ``beyond`` the law's own:
+    an even H lacks no odd terms; sampled_rows: per term, where what is left over is looked at,
+    fewest_sampled: pairs at least, of many sites numbers; white_pairs: whose residuals say whether
+    a law leaves anything but noise. max_operations: of the flows that are evaluated on the way,
+    counted: what a quiet core makes in half a minute, at 5e8 a second (two bodies, three bodies,
+    pendulums), within which all laws of the benchmarks are found that are found at all;
+    mode_operations: the same where there are angles, a minute at 7e8 a second, for a double
+    pendulum's L.
     evaluations: of the flow and its derivatives, that a fit of a library is expected to take;
     close: of terms that are known to be close to their optimum. only_within: whether a law that
     misses the tolerance is of no use, so that the search ends where it is out of reach.
@@ -73,8 +72,9 @@ class LawOptions:
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
     feature_degrees: tuple[int, ...] = (2, 3)
-    given_degrees: tuple[int, ...] = (0, 2, 3, 4)
-    given_products: tuple[int, ...] = (2,)
+    given_degrees: tuple[int, ...] = (2, 3, 4)
+    boxes: tuple[tuple[int, int], ...] = ((1, 1), (1, 2), (2, 2), (1, 4), (3, 2), (12, 2))
+    given_boxes: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (3, 2), (4, 4))
     most_terms: int = 350
     most_modes: int = 500
     rows_per_term: float = 1.6
@@ -86,7 +86,7 @@ class LawOptions:
     gained_alone: float = 0.8
     poor: int = 2
     poor_given: int = 3
-    poor_structured: int = 5
+    poor_in_kind: int = 5
     hopeless: float = 10.0
     affine_rows: int = 50_000
     small: int = 35
@@ -94,7 +94,6 @@ class LawOptions:
     on_branch: float = 0.05
     turning: int = 2_000
     truncation: float = 0.1
-    goal: float = 0.3
     generators: tuple[int, ...] = (2, 3, 4, 5, 6)
     beyond: int = 2
     named: int = 5
@@ -104,8 +103,6 @@ class LawOptions:
     white_pairs: int = 2_000
     max_operations: float = 1.5e10
     mode_operations: float = 4.2e10
-    growth_part: float = 0.7
-    first_round: float = 5e8
     evaluations: float = 20.0
     close: float = 6.0
     only_within: bool = True
@@ -299,6 +296,12 @@ class LawProblem:
     def simple(self) -> bool:
         """Return whether the pairs depend on nothing but their states, and have no structure."""
         return self.data.args is None and self.data.structure is None
+
+    @property
+    def of_modes(self) -> bool:
+        """Return whether libraries are of modes: of an angle that enters H by itself."""
+        features = self.scene is not None and self.scene.features is not None
+        return bool(angles_and_others(self.data)[0]) and self.data.args is None and not features
 
     @property
     def most_terms(self) -> float:

@@ -22,7 +22,6 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
-from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.told import Constrained
 from gfnn_jax.fitting.evidence import EVIDENCE
@@ -43,13 +42,12 @@ from gfnn_jax.models.hamiltonians.libraries import (
     breaks_bounds,
     check_finite,
     held_at_bounds,
-    modes_of,
     own_terms,
     root_of_all,
     unbound,
     within_bounds,
 )
-from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_polynomials
+from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_libraries
 from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
 from gfnn_jax.models.hamiltonians.sequences import arcs_of, fitted_to_sequences
 from gfnn_jax.models.hamiltonians.symmetries import imposed
@@ -62,13 +60,12 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
     started, data, options = time.perf_counter(), problem.data, problem.options
-    basis = modes_of(problem)
     if data.before or data.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     own = own_terms(problem)
     if own is not None and data.structure is None:
         check_finite(own, data, data.training)
-    most = options.max_operations if basis is None else options.mode_operations
+    most = options.mode_operations if problem.of_modes else options.max_operations
     if not problem.terms and problem.scene is None:
         of_sequences = problem.beginning(data, most)
         whole = law_of_sequences(of_sequences)
@@ -89,7 +86,7 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(everywhere.training), bool)
     inner = problem.on(everywhere.trained_on(everywhere.training[~outer]))
-    best = _best_law(inner, basis)
+    best = _best_law(inner)
     everyone = np.arange(len(inner.data)) if is_smooth(best.family) else best.rows
     if inner.flows.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError(
@@ -135,13 +132,13 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     )
 
 
-def _best_law(problem: LawProblem, basis: Modes | None) -> FittedLaw:
-    """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
+def _best_law(problem: LawProblem) -> FittedLaw:
+    """The law of the smallest libraries, of physics, of a mechanical system or of the libraries,
     the first within the tolerance, else the best."""
     with_masses, best, early = None, None, dict[int, FittedLaw]()
     if not problem.terms and problem.scene is None:
-        if basis is None and problem.simple:
-            early = small_polynomials(problem)
+        if problem.simple:
+            early = small_libraries(problem)
             last = next(reversed(early.values()), None)
             best = last if last is not None and is_exact(problem, last) else None
         if best is None:
@@ -150,7 +147,7 @@ def _best_law(problem: LawProblem, basis: Modes | None) -> FittedLaw:
             best = with_masses = mechanical(problem)
     if best is None or not problem.met_by(best):
         try:
-            best = of_libraries(problem, basis, early)
+            best = of_libraries(problem, early)
         except (OutOfTime, FitError):
             if best is None:
                 raise
