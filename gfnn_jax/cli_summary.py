@@ -22,10 +22,8 @@ def law_line(report: dict[str, Any]) -> str:
     chosen = report["model"]["learns"] == "hamiltonian"
     noisy = report["data"]["noise"] is not None and len(law["terms"]) <= _FEW_TERMS
     if chosen and not fit["tolerance_met"] and not noisy:
-        return (
-            f"best partial law: H of {len(law['terms'])} terms, one-step error "
-            f"{fit['validation_relative']:.1e} of the spread (report.json)"
-        )
+        error = f"one-step error {fit['validation_relative']:.1e} of the spread"
+        return f"best partial law: H of {len(law['terms'])} terms, {error} (report.json)"
     return f"{'' if chosen else 'found, and costlier per step than the map: '}H = {law['formula']}"
 
 
@@ -165,10 +163,8 @@ def print_predicted(predicted: Any, asked: Any, out: Path) -> None:
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(
-            f"the band of the position (2 σ) exceeds {asked.horizon:g} in {passed.size} of "
-            f"{num_lanes} trajectories{first}"
-        )
+        where = f"{passed.size} of {num_lanes} trajectories{first}"
+        print(f"the band of the position (2 σ) exceeds {asked.horizon:g} in {where}")
 
 
 def _print_status(status, left_at) -> None:

@@ -211,10 +211,8 @@ class Pairs:
                 continue
             values = np.asarray(given)
             if values.shape != (len(self),) or values.dtype.kind not in kinds:
-                raise FitError(
-                    f"expected {name} as {what} of shape ({len(self)},), got {values.dtype} of "
-                    f"shape {values.shape}"
-                )
+                got = f"{values.dtype} of shape {values.shape}"
+                raise FitError(f"expected {name} as {what} of shape ({len(self)},), got {got}")
             self._set(name, values.astype(str) if values.dtype.kind in "SO" else values)
 
     def _set_time(self) -> None:

@@ -68,10 +68,9 @@ class Block:
             if bad.any():
                 row, column = (int(i) for i in np.argwhere(bad)[0])
                 count = int(bad.sum())
-                raise InputError(
-                    f"{path}: {count} value{'s' * (count != 1)} {what}, first "
-                    f"{self.locate(row, column)} = {self.states[row, column]}"
-                )
+                first = f"{self.locate(row, column)} = {self.states[row, column]}"
+                values = f"{count} value{'s' * (count != 1)}"
+                raise InputError(f"{path}: {values} {what}, first {first}")
         return self
 
 

@@ -383,15 +383,11 @@ def time_unit_of(source: str, times: Sequence[str], units: Units, given: str | N
     for name in times:
         told = _time_unit(name, units)
         if told is None and given is None and _unit(units, name):
-            raise InputError(
-                f"{source}: {name}: unit {units[name]!r} is not known; give it, one of "
-                f"{', '.join(SECONDS)}: --time-unit"
-            )
+            asked = f"give it, one of {', '.join(SECONDS)}: --time-unit"
+            raise InputError(f"{source}: {name}: unit {units[name]!r} is not known; {asked}")
         if told is not None and given is not None and clock_of(told) != clock_of(given):
-            raise InputError(
-                f"{source}: {name} is in {told} by its header, got the time unit {given} "
-                "(--time-unit)"
-            )
+            got = f"got the time unit {given} (--time-unit)"
+            raise InputError(f"{source}: {name} is in {told} by its header, {got}")
         if told is not None:
             return told
     return given
@@ -457,10 +453,9 @@ def check_sigmas(source: str, sigmas: Mapping[str, str], values: Mapping[str, An
             sigma = columns[of]
             bad = np.isfinite(columns[name]) & ~(np.isfinite(sigma) & (sigma > 0))
             if bad.any():
-                raise InputError(
-                    f"{source}: {of}: expected σ above 0 beside every value of {name}, got "
-                    f"{sigma[bad][0]:g} ({bad.sum()} such rows in run {run})"
-                )
+                got = f"{sigma[bad][0]:g} ({bad.sum()} such rows in run {run})"
+                beside = f"beside every value of {name}"
+                raise InputError(f"{source}: {of}: expected σ above 0 {beside}, got {got}")
 
 
 def typical(

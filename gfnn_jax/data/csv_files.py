@@ -64,10 +64,9 @@ class _StatesInText:
         found = {"missing": missing, "without a partner": others, "without numbers": words}
         for what, columns in found.items():
             if columns or not self.states:
-                raise InputError(
-                    f"{self.path}: the header must name q1..qd and p1..pd once each: "
-                    f"{', '.join(columns)} {what} in {','.join(self.file.names)}"
-                )
+                found = f"{', '.join(columns)} {what} in {','.join(self.file.names)}"
+                wanted = "the header must name q1..qd and p1..pd once each"
+                raise InputError(f"{self.path}: {wanted}: {found}")
 
     def _tables(self, rows: int) -> Generator[dict[str, np.ndarray], None, None]:
         """All columns of numbers by name, a block of rows at a time; sequences as numbers."""
@@ -84,11 +83,9 @@ class _StatesInText:
         moving = [n for n, step in steps.items() if np.any(step[same] != 0)]
         ignored = [*moving, *(n.lower() for n in self.file.text)]
         if ignored:
-            warnings.warn(
-                f"{self.path}: columns ignored: {', '.join(ignored)} (not constant in a sequence)",
-                blocks.DataWarning,
-                stacklevel=6,
-            )
+            names = f"{', '.join(ignored)} (not constant in a sequence)"
+            what = f"{self.path}: columns ignored: {names}"
+            warnings.warn(what, blocks.DataWarning, stacklevel=6)
         return ignored
 
     def _check_period(self, table: dict[str, np.ndarray], period: float) -> None:
@@ -113,10 +110,9 @@ class _StatesInText:
             begins = both[1:, 0] != both[:-1, 0]
             for row in np.flatnonzero(begins):
                 if sequence[row] in earlier or not np.isfinite(sequence[row]):
-                    raise InputError(
-                        f"{self.path}: {self.file.locate(begin + int(row))}: the rows of sequence "
-                        f"{sequence[row]:g} must stand together"
-                    )
+                    place = f"{self.path}: {self.file.locate(begin + int(row))}"
+                    rows_of = f"the rows of sequence {sequence[row]:g}"
+                    raise InputError(f"{place}: {rows_of} must stand together")
                 if "sequence" in table:
                     earlier.add(float(sequence[row]))
             if self.with_time:
@@ -158,10 +154,9 @@ class _StatesInText:
         bad = ((sequence[1:] == sequence[:-1]) & ~(np.diff(time) > 0)) | ~np.isfinite(time[1:])
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(
-                f"{self.path}: the column t must rise in a sequence, found {time[row + 1]:.9g} in "
-                f"{self.file.locate(begin + row)} after {time[row]:.9g}"
-            )
+            where = f"in {self.file.locate(begin + row)} after {time[row]:.9g}"
+            found = f"found {time[row + 1]:.9g} {where}"
+            raise InputError(f"{self.path}: the column t must rise in a sequence, {found}")
 
 
 def _first_dt(states: _StatesInText, table: dict[str, np.ndarray]) -> float | None:

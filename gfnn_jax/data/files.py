@@ -111,10 +111,8 @@ def read_trajectories(
     lengths, pairs = np.diff(begins, append=len(sequence)), len(going)
     needed = 2 * source.dim + 1 if fewest is None else fewest
     if pairs < needed:
-        raise InputError(
-            f"{path}: {pairs} pair{'s' * (pairs != 1)} of consecutive states found, at least "
-            f"{needed} are needed for d = {source.dim}"
-        )
+        found = f"{pairs} pair{'s' * (pairs != 1)} of consecutive states found"
+        raise InputError(f"{path}: {found}, at least {needed} are needed for d = {source.dim}")
     for odd in _odd_columns(states, going):
         warnings.warn(f"{path}: {odd}", blocks.DataWarning, stacklevel=2)
     known = (labels(sequence[going]), whole.place[going])
@@ -209,20 +207,16 @@ def read_initial(
     driven = blocks.TIME in parameters
     with opened(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
-            raise InputError(
-                f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
-                f"{2 * source.dim} columns (d = {source.dim})"
-            )
+            wanted, got = (f"{2 * d} columns (d = {d})" for d in (dim, source.dim))
+            raise InputError(f"{path}: expected states of {wanted}, found {got}")
         columns = {name: 1 + i for i, name in enumerate(source.parameters)}
         if driven and "t0" in columns:
             columns[blocks.TIME] = columns["t0"]
         elif driven and source.timed:
             columns[blocks.TIME] = 0
         if driven and blocks.TIME not in columns:
-            raise InputError(
-                f"{path}: expected t0, the time of the drive that the model was learned with, "
-                "beside the states; found none"
-            )
+            t0 = "t0, the time of the drive that the model was learned with"
+            raise InputError(f"{path}: expected {t0}, beside the states; found none")
         missing = [name for name in parameters if name not in columns]
         if missing:
             raise InputError(

@@ -43,10 +43,10 @@ class _StoredArray:
             raise InputError(f"{path}: {name} must hold real numbers, found {self.dtype}{hint}")
         expected = math.prod(self.shape) * self.dtype.itemsize
         if size - stream.tell() != expected:
-            raise InputError(
-                f"{path}: {name} is damaged: {expected} bytes expected for shape {self.shape}, "
-                f"{size - stream.tell()} found"
+            there = (
+                f"{expected} bytes expected for shape {self.shape}, {size - stream.tell()} found"
             )
+            raise InputError(f"{path}: {name} is damaged: {there}")
 
     def whole(self) -> np.ndarray:
         with blocks.damage(self.path, self.name):
@@ -99,10 +99,8 @@ class _Archive:
         """The times (count,) of a drive."""
         t0 = np.atleast_1d(self.array("t0").whole().astype(np.float64))
         if t0.shape != (count,) or not np.isfinite(t0).all():
-            raise InputError(
-                f"{self.path}: t0 must be finite, of shape ({count},), found {t0.shape}"
-                + ("" if np.isfinite(t0).all() else " with NaN or infinity")
-            )
+            found = f"{t0.shape}{'' if np.isfinite(t0).all() else ' with NaN or infinity'}"
+            raise InputError(f"{self.path}: t0 must be finite, of shape ({count},), found {found}")
         return t0
 
     def parameters(self) -> tuple[tuple[str, ...], np.ndarray | None]:
@@ -121,10 +119,8 @@ class _Archive:
             with blocks.damage(self.path, "param_names", *_OF_HEADERS), np.load(self.path) as file:
                 names = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
             if len(names) != values.shape[1] or len(set(names)) < len(names):
-                raise InputError(
-                    f"{self.path}: param_names must be {values.shape[1]} different names, found "
-                    f"{', '.join(names)}"
-                )
+                wanted, found = f"{values.shape[1]} different names", ", ".join(names)
+                raise InputError(f"{self.path}: param_names must be {wanted}, found {found}")
         return names, values
 
 
@@ -150,9 +146,9 @@ class _Sequences(NamedTuple):
         array, shape, of_pairs = self.arrays[0], self.arrays[0].shape, len(self.arrays) == 2
         if of_pairs:
             if len(shape) != 2 or shape != self.arrays[1].shape:
+                found = f"{shape} and {self.arrays[1].shape}"
                 raise InputError(
-                    f"{self.path}: z0 and z1 must both have shape (N, 2d), found {shape} and "
-                    f"{self.arrays[1].shape}"
+                    f"{self.path}: z0 and z1 must both have shape (N, 2d), found {found}"
                 )
         elif len(shape) not in (2, 3) or (self.each_row and len(shape) != 2):
             wanted = "(B, 2d)" if self.each_row else "(L, 2d) or (M, L, 2d)"
@@ -165,10 +161,8 @@ class _Sequences(NamedTuple):
         names, values = self.parameters
         if values is not None and len(values) != count:
             what = "pairs" if of_pairs else "states" if self.each_row else "sequences"
-            raise InputError(
-                f"{self.path}: params must have a row for each of the {count} {what}, found "
-                f"{values.shape}"
-            )
+            wanted = f"a row for each of the {count} {what}"
+            raise InputError(f"{self.path}: params must have {wanted}, found {values.shape}")
         if self.lengths is not None:
             _check_lengths(self.path, self.lengths, count, length)
         own = None
@@ -234,10 +228,9 @@ def open_npz(request: blocks.Request, stream) -> blocks.Source:
     is_pairs = "z0" in archive and "z1" in archive
     if is_pairs == ("trajectories" in archive):
         names = archive.names
-        raise InputError(
-            f"{path}: expected either the arrays z0 and z1, or trajectories; found "
-            f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
-        )
+        found = f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
+        wanted = "either the arrays z0 and z1, or trajectories"
+        raise InputError(f"{path}: expected {wanted}; found {found}")
     further = [name for name in archive.names if name not in _READ]
     if further and "job" not in further:  # other arrays of a prediction are about it
         ignored = f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)"
@@ -274,10 +267,8 @@ def _pairs(
         bad = ~(np.isfinite(dt) & (dt > 0))
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(
-                f"{path}: dt must be finite and above 0, found {int(bad.sum())} that are not, "
-                f"first dt[{row}] = {dt[row]:g}"
-            )
+            found = f"{int(bad.sum())} that are not, first dt[{row}] = {dt[row]:g}"
+            raise InputError(f"{path}: dt must be finite and above 0, found {found}")
         times = np.stack([np.zeros(len(dt)), dt], axis=1)
     if period is not None:
         t0 = np.mod(archive.t0(z0.shape[0] if z0.shape else 0), period)
@@ -317,10 +308,8 @@ def _times_dt(path, times, shape, lengths) -> float:
     """The time step of ``times`` (M, L), NaN where they are uneven."""
     times = times[None] if times.ndim == 1 else times
     if times.shape != ((1, *shape[:1]) if len(shape) == 2 else shape[:2]):
-        raise InputError(
-            f"{path}: times must have the shape of the trajectories without the last axis, found "
-            f"{times.shape} beside {shape}"
-        )
+        wanted = "the shape of the trajectories without the last axis"
+        raise InputError(f"{path}: times must have {wanted}, found {times.shape} beside {shape}")
     steps = np.diff(times, axis=1)
     used = np.ones(steps.shape, bool)
     if lengths is not None and lengths.shape == times.shape[:1]:
@@ -328,10 +317,8 @@ def _times_dt(path, times, shape, lengths) -> float:
     bad = ~(np.isfinite(steps) & (steps > 0)) & used
     if bad.any():
         m, i = (int(k) for k in np.argwhere(bad)[0])
-        raise InputError(
-            f"{path}: times must rise, found times[{m}, {i + 1}] = {times[m, i + 1]:g} after "
-            f"{times[m, i]:g}"
-        )
+        found = f"times[{m}, {i + 1}] = {times[m, i + 1]:g} after {times[m, i]:g}"
+        raise InputError(f"{path}: times must rise, found {found}")
     usual = float(np.median(steps[used])) if used.any() else np.nan
     slack = blocks.TIME_TOLERANCE * usual + 4 * np.finfo(np.float64).eps * np.abs(times[:, 1:])
     even = bool((np.abs(steps - usual) <= slack)[used].all())
@@ -350,10 +337,8 @@ def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
 
 def _check_lengths(path, lengths: np.ndarray, count: int, longest: int) -> None:
     if lengths.shape != (count,) or lengths.dtype.kind not in "iu":
-        raise InputError(
-            f"{path}: lengths must be integers of shape ({count},), found {lengths.dtype} of shape "
-            f"{lengths.shape}"
-        )
+        found = f"{lengths.dtype} of shape {lengths.shape}"
+        raise InputError(f"{path}: lengths must be integers of shape ({count},), found {found}")
     bad = np.flatnonzero((lengths < 1) | (lengths > longest))
     if len(bad):
         first = f"first lengths[{bad[0]}] = {lengths[bad[0]]}"

@@ -144,10 +144,8 @@ class PredictionWriter:
             return
         outputs.ensure_new(self.out, overwrite)
         if self.partial.exists() and not (overwrite or resume):
-            raise InputError(
-                f"{self.partial}: an unfinished prediction (--resume goes on with it, --overwrite "
-                "discards it)"
-            )
+            ways = "--resume goes on with it, --overwrite discards it"
+            raise InputError(f"{self.partial}: an unfinished prediction ({ways})")
         with outputs.failures_as_work_errors(self.out):
             self._discard()
             self.partial.mkdir(parents=True)
@@ -164,10 +162,8 @@ class PredictionWriter:
         stop = self.saved + (states.shape[1] if states.ndim == 3 else 0)
         expected = (self.lanes, stop - self.saved, self.width)
         if states.shape != expected or not self.saved < stop <= self.total:
-            raise ValueError(
-                f"expected states ({self.lanes}, at most {self.total - self.saved}, {self.width}), "
-                f"got {states.shape}"
-            )
+            wanted = f"({self.lanes}, at most {self.total - self.saved}, {self.width})"
+            raise ValueError(f"expected states {wanted}, got {states.shape}")
         carry = {name: np.asarray(value) for name, value in carry.items()}
         if any(value.dtype.hasobject for value in carry.values()):
             raise TypeError("the carry must be arrays of numbers")
@@ -285,18 +281,15 @@ class PredictionWriter:
         self._overwrite = self._overwrite or began.get("overwrite") is True
         for key in {**job, **self._job}:
             if job.get(key) != self._job.get(key):
-                raise InputError(
-                    f"{self.partial}: belongs to another prediction: {key} is {job.get(key)} there "
-                    f"and {self._job.get(key)} here. --overwrite discards it"
-                )
+                differs = f"{key} is {job.get(key)} there and {self._job.get(key)} here"
+                whose = f"{self.partial}: belongs to another prediction"
+                raise InputError(f"{whose}: {differs}. --overwrite discards it")
         for line in lines[1:]:
             carry = self._verified_carry(line)
             if carry is None:
-                warnings.warn(
-                    f"{self.partial}: a chunk is damaged or half written: going on from saved "
-                    f"state {self.saved} instead",
-                    stacklevel=3,
-                )
+                again = f"going on from saved state {self.saved} instead"
+                what = f"{self.partial}: a chunk is damaged or half written: {again}"
+                warnings.warn(what, stacklevel=3)
                 break
             entry = json.loads(line)
             self._chunks.append(entry)

@@ -528,10 +528,8 @@ def parameters_of(recording: Recording) -> tuple[str, ...]:
         columns = recording.each(recording.values, name)
         for run, column in zip(recording.runs, columns, strict=True):
             if not (np.isfinite(column).all() and np.ptp(column) == 0):
-                raise InputError(
-                    f"{recording.source}: parameter {name} is not one number in run {run}. Name "
-                    "what changes within a run an input: --inputs"
-                )
+                found = f"{recording.source}: parameter {name} is not one number in run {run}"
+                raise InputError(f"{found}. Name what changes within a run an input: --inputs")
         if len({float(column[0]) for column in columns}) > 1:
             found.append(name)
     return tuple(found)

@@ -164,10 +164,9 @@ def from_arrays(path: Path, columns: Sequence[str]) -> Table:
                 loaded = dict(archive.items())
     if isinstance(loaded, np.ndarray) and not loaded.dtype.names:
         if loaded.ndim != 2 or loaded.shape[1] != len(columns):
-            raise InputError(
-                f"{path}: expected --columns with the names of the columns of an array (T, k), got "
-                f"{len(columns)} names for shape {loaded.shape}"
-            )
+            wanted = "--columns with the names of the columns of an array (T, k)"
+            got = f"{len(columns)} names for shape {loaded.shape}"
+            raise InputError(f"{path}: expected {wanted}, got {got}")
         loaded = dict(zip(columns, loaded.T, strict=True))
     return dataclasses.replace(from_memory(loaded), source=str(path))
 

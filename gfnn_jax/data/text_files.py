@@ -82,9 +82,9 @@ class TextFile:
         cells = [self._cells(line) for _, line in of_file]
         first = self._first_row(cells)
         if first is None:
+            found = _shown(of_file[: _Options.shown])
             raise InputError(
-                f"{path}: expected rows of numbers below a line of names, found "
-                f"{_shown(of_file[: _Options.shown])}"
+                f"{path}: expected rows of numbers below a line of names, found {found}"
             )
         self._first = of_file[first][0] - 1  # lines before the first row of numbers
         rows, above = cells[first:], cells[:first]
@@ -322,10 +322,8 @@ class TextFile:
             spread = float(np.std(steps)) if len(steps) else 0.0
             found.append((spread, float(np.median(steps)), way))
         if not found:
-            raise InputError(
-                f"{self.path}: {self.times[0]}: expected times like 2024-05-01 23:59:59.5 "
-                f"({reason})"
-            )
+            wanted = "expected times like 2024-05-01 23:59:59.5"
+            raise InputError(f"{self.path}: {self.times[0]}: {wanted} ({reason})")
         _, step, way = min(found, key=lambda one: one[0])
         second = 24 * 3600.0 if step >= _Options.daily else 1.0
         unit = "s" if second == 1 else "d"

@@ -38,10 +38,8 @@ def check_varied(pairs: Pairs) -> None:
         and np.asarray(pairs.period).dtype.kind in "fiu"
         and 0 < float(pairs.period) < np.inf
     ):
-        raise FitError(
-            "expected a number that is finite and above 0 as the drive's period, got "
-            f"{pairs.period!r}"
-        )
+        wanted = "a number that is finite and above 0 as the drive's period"
+        raise FitError(f"expected {wanted}, got {pairs.period!r}")
     try:
         check_names(pairs.dim, tuple(name for name in args if name != TIME))
     except InputError as error:
@@ -54,10 +52,8 @@ def check_varied(pairs: Pairs) -> None:
         if bad.any():
             what = "finite time steps above 0" if name == "dt" else f"finite values of {name}"
             row = int(np.argmax(bad))
-            raise FitError(
-                f"expected {what}, got {int(bad.sum())} of {len(bad)} that are not, the first is "
-                f"{values[row]} in row {row}"
-            )
+            got = f"{int(bad.sum())} of {len(bad)} that are not"
+            raise FitError(f"expected {what}, got {got}, the first is {values[row]} in row {row}")
 
 
 def as_varied(

@@ -124,10 +124,8 @@ class LearnedDamping:
         if self.uniform:
             return f"every step multiplies areas by {factors[0]}{by}, one factor for all states"
         planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(factors, 1)]
-        return (
-            f"every step multiplies areas by {', '.join(planes)}{by}: no multiple of the "
-            "symplectic form is kept"
-        )
+        areas = f"every step multiplies areas by {', '.join(planes)}{by}"
+        return f"{areas}: no multiple of the symplectic form is kept"
 
     def line(self, dt: float) -> str:
         """Line about what was learned, with the rate γ of p' = −γ p where one factor b = e^(−γ dt)

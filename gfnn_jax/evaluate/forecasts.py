@@ -98,10 +98,8 @@ def _forecasts(
     places = ((run, t, k) for run, t in times.items() for k in range(first, len(t) - 1))
     starts = [(run, k) for run, t, k in places if t[k] + ahead[-1] <= t[-1]]
     if not starts:
-        raise InputError(
-            f"{recording.source}: no run has {_Options.samples} samples and {ahead[-1]:.3g} s "
-            "behind them that no fit has seen"
-        )
+        lacking = f"{_Options.samples} samples and {ahead[-1]:.3g} s behind them"
+        raise InputError(f"{recording.source}: no run has {lacking} that no fit has seen")
     chosen = np.linspace(0, len(starts) - 1, min(_Options.starts, len(starts))).astype(int)
     begins = (starts[i] for i in chosen)
     each = tuple(forecast(recording, run, k, ahead[-1]) for run, k in begins)

@@ -249,10 +249,8 @@ def _forecasts(
 def _not_identified(law: LearnedLaw) -> Iterator[str]:
     yield from (f"The record does not distinguish: {in_letters(pair)}." for pair in law.alike)
     for term, limit in law.which_friction.limits.items():
-        yield (
-            f"No friction of the form {in_letters(term)} is seen: its coefficient in R is below "
-            f"{limit:.2g} (2 σ)."
-        )
+        unseen = f"No friction of the form {in_letters(term)} is seen"
+        yield f"{unseen}: its coefficient in R is below {limit:.2g} (2 σ)."
     if law.delay is not None and not np.isfinite(law.delay[1]):
         yield "The delay of the inputs is not determined."
 

@@ -147,10 +147,8 @@ def refuse_other_units(recording: Recording, job: dict[str, Any]) -> None:
         angles = all(unit.strip().lower().startswith(_ANGLES) for unit in (own, known))
         same = angles and own.partition("/")[2] == known.partition("/")[2]
         if own and known and own != known and not same:
-            raise InputError(
-                f"{recording.source}: expected {name} in {known}, in which the model was learned, "
-                f"got {own}"
-            )
+            wanted = f"{name} in {known}, in which the model was learned"
+            raise InputError(f"{recording.source}: expected {wanted}, got {own}")
 
 
 BEST = "best"

@@ -62,10 +62,8 @@ class Steps:
     def check(self) -> None:
         """Raises InputError where the options contradict each other."""
         if self.save_every > abs(self.num_steps):
-            raise InputError(
-                f"expected --save-every of at most {abs(self.num_steps)} (--num-steps), got "
-                f"{self.save_every}"
-            )
+            most, got = abs(self.num_steps), self.save_every
+            raise InputError(f"expected --save-every of at most {most} (--num-steps), got {got}")
         if self.horizon is not None and self.samples is None:
             raise InputError("--horizon needs --samples: the band is the spread of samples")
 
@@ -220,10 +218,8 @@ def _states_of(map_: SymplecticMap, model: Path, initial: Path) -> tuple[np.ndar
             "with their columns, or an .npz with z0 and an array of each name"
         )
     if z0.ndim != 2 or z0.shape[1] != bracket.size or not np.isfinite(z0).all():
-        raise InputError(
-            f"{initial}: expected states {', '.join(bracket.labels)} that are finite, got an array "
-            f"{z0.shape}"
-        )
+        wanted = f"states {', '.join(bracket.labels)} that are finite"
+        raise InputError(f"{initial}: expected {wanted}, got an array {z0.shape}")
     try:
         bracket.require_inside(z0)
     except FitError as error:
@@ -298,10 +294,8 @@ class _Prediction:
         except KeyboardInterrupt as stop:
             if not writer.finished:
                 done = max(0, writer.saved - 1) * asked.save_every
-                stop.add_note(
-                    f"{writer.partial} keeps {done} of {abs(asked.num_steps)} steps: --resume goes "
-                    "on with it"
-                )
+                kept = f"{done} of {abs(asked.num_steps)} steps"
+                stop.add_note(f"{writer.partial} keeps {kept}: --resume goes on with it")
             raise
         return Predicted(status, left_at, time.perf_counter() - started, passed)
 

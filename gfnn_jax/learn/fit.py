@@ -132,10 +132,8 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
         warn(about_pairs)
         count = len(request.pairs)
         if not_looked_at := count - len(looked_for_errors(count)):
-            budget.leave_out(
-                f"the search for outliers in {not_looked_at:,} of {count:,} pairs",
-                "those that the final map misses by far are found at the end",
-            )
+            what = f"the search for outliers in {not_looked_at:,} of {count:,} pairs"
+            budget.leave_out(what, "those that the final map misses by far are found at the end")
         data = data.divided(options.seed)
         for asked, same in structures_to_try(request, data):
             request, data = asked, same

@@ -177,10 +177,8 @@ class Choice:
             return f"one of several: {self.several}"
         relative = self.chosen.validation_relative
         if relative > _Options.hides:
-            return (
-                f"one of several: noise of {relative:.0%} of the spread in a step hides what "
-                "another law would leave"
-            )
+            noise = f"noise of {relative:.0%} of the spread in a step"
+            return f"one of several: {noise} hides what another law would leave"
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         if rivals:
             return f"one of several: {'; '.join(rivals)} is as likely"
@@ -295,10 +293,9 @@ class Fit:
         """The recording that the law was learned from. Raises ValueError where a folder gave the
         fit, which holds no data, and for a fit of pairs."""
         if self.data is None:
-            raise ValueError(
-                "expected a fit that has its recording, and a folder holds none: give it, as in "
-                "fit.forecast(times, after=gfnn.read(FILE))"
-            )
+            call = "fit.forecast(times, after=gfnn.read(FILE))"
+            why = "expected a fit that has its recording, and a folder holds none"
+            raise ValueError(f"{why}: give it, as in {call}")
         return self.data if self.learned_to is None else self.data.slice(stop=self.learned_to)
 
     @property

@@ -170,17 +170,13 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
     else:
         matrix = np.asarray(stretch, float)
     if matrix.shape != (2 * dim, 2 * dim) or not np.isfinite(matrix).all():
-        raise InputError(
-            f"expected the length of a drift or a matrix of shape {(2 * dim, 2 * dim)}, got "
-            f"{np.shape(stretch)}"
-        )
+        wanted, got = (2 * dim, 2 * dim), np.shape(stretch)
+        raise InputError(f"expected the length of a drift or a matrix of shape {wanted}, got {got}")
     form = symplectic_form(dim)
     defect = np.abs(matrix.T @ form @ matrix - form).max()
     if not defect < _Options.symplectic * max(1.0, np.abs(matrix).max() ** 2):
-        raise InputError(
-            f"between: expected symplectic matrices in q1…qd, p1…pd, got one with |MᵀJM − J| of "
-            f"{defect:.2g}"
-        )
+        got = f"one with |MᵀJM − J| of {defect:.2g}"
+        raise InputError(f"between: expected symplectic matrices in q1…qd, p1…pd, got {got}")
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _Options.singular * max(values[0], 1e-300):
         raise InputError(

@@ -316,10 +316,8 @@ def _generated(data: Data, bracket: Bracket | None) -> _Learned:
             "may depend on them: gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
         )
     if bracket is None:
-        raise FitError(
-            "a map without a law needs its bracket, such as "
-            "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
-        )
+        model = "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
+        raise FitError(f"a map without a law needs its bracket, such as {model}")
     if np.ndim(data.dt):
         raise FitError("a map without a law is one of pairs with one dt")
     y0, y1 = (_inner(z, bracket) for z in (data.z0, data.z1))

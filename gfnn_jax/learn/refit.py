@@ -74,10 +74,8 @@ def why_not(map_: SymplecticMap) -> str:
 
 def not_refitted(fitted: Fit, why: str) -> Fit:
     """The fit of a sample as it is, with a warning (FitWarning) that says so, and why."""
-    message = (
-        f"{fitted.chosen.label} is fitted to a sample of {fitted.num_pairs} pairs, not to all of "
-        f"them: {why}"
-    )
+    done = f"{fitted.chosen.label} is fitted to a sample of {fitted.num_pairs} pairs"
+    message = f"{done}, not to all of them: {why}"
     warnings.warn(message, FitWarning, stacklevel=2)
     return fitted.replaced(messages=(*fitted.messages, message))
 

@@ -86,10 +86,8 @@ def check_request(
     if pairs.period is not None and options.chart == "type1":
         raise FitError("expected another chart than type1 for a driven map")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
-        raise FitError(
-            f"expected a time step that is finite and above 0, got {pairs.dt}"
-            + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
-        )
+        mended = (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
+        raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}{mended}")
     known = () if options.base is None else (options.base,)
     try:
         if anything_told(options.terms):
@@ -106,10 +104,9 @@ def check_request(
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         finite = np.isfinite(np.asarray(z)).all(axis=1)
         if not finite.all():
-            raise FitError(
-                f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
-                f"infinity, the first is row {int(np.argmin(finite))}"
-            )
+            bad = f"{int((~finite).sum())} rows of {name} with NaN or infinity"
+            first = int(np.argmin(finite))
+            raise FitError(f"expected finite states, got {bad}, the first is row {first}")
     if structure is None:
         check_number(pairs)
     elif len(pairs) < FEWEST:
@@ -245,10 +242,8 @@ def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     move = np.abs(np.asarray(pairs.z1) - np.asarray(pairs.z0))
     count, indices = int((move[:, found] > np.pi).any(axis=1).sum()), ",".join(map(str, found))
     named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
-    return [
-        f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
-        f"wrapped; name it: --angles {indices}"
-    ]
+    jumps = f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs"
+    return [f"{jumps}, as of an angle that is wrapped; name it: --angles {indices}"]
 
 
 @dataclasses.dataclass(frozen=True)

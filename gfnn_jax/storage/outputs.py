@@ -278,10 +278,8 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
         return
     if not resume:
         if not overwrite:
-            raise InputError(
-                f"{folder}: holds an unfinished {what} (--resume continues it, --overwrite "
-                "discards it)"
-            )
+            ways = "--resume continues it, --overwrite discards it"
+            raise InputError(f"{folder}: holds an unfinished {what} ({ways})")
         return _discard(folder)
     try:
         found = json.loads((folder / JOB).read_text(encoding="utf-8"))
