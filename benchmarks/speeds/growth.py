@@ -19,6 +19,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.threads import one_thread
 
 
 def scaling(quick: bool) -> Numbers:
@@ -40,7 +41,8 @@ def scaling(quick: bool) -> Numbers:
             triangles = [least_squares.reduce(family, [rows], np.ones(4)) for rows in some]
             return least_squares.solve(triangles[0], triangles[1], family.num_parameters)
 
-        taken = timed(fitted, 1)
+        with one_thread():  # as in `gfnn.fit`
+            taken = timed(fitted, 1)
         return taken.seconds, family.num_parameters
 
     def step_seconds(dim, lanes, num_steps=100):
