@@ -415,6 +415,22 @@ def orbit_off_the_origin(rng: np.random.Generator) -> System:
     )
 
 
+def two_bodies(rng: np.random.Generator) -> System:
+    """On springs of their own, with the force of Toda, of Morse or 1/r² between them."""
+    a, depth = rng.uniform(0.6, 1.4), rng.uniform(0.4, 1)
+    k1, k2 = rng.uniform(0.3, 1, 2).tolist()
+    apart = f"exp({a}*(x1-x2))"
+    between = (
+        {apart: -depth, "x1": a * depth, "x2": -a * depth},
+        {apart: 2 * depth, f"{apart}**2": -depth},
+        {"1/(2-x1+x2)": -depth, "x1": depth / 4, "x2": -depth / 4},
+    )[rng.integers(3)]
+    body = {"v1**2": 0.5, "v2**2": rng.uniform(0.35, 0.75), "x1**2": -k1 / 2, "x2**2": -k2 / 2}
+    side = 1 if rng.integers(2) else -1
+    start = -side * rng.uniform(0.4, 1), side * rng.uniform(0.4, 1)
+    return System({**body, **between}, (start, (0.0, 0.0)))
+
+
 SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -426,7 +442,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
         *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
         *(elastic_on_video, orbit_off_the_origin),
-        *(load_friction, jointed_arm, polar),
+        *(load_friction, jointed_arm, polar, two_bodies),
     )
 }
 

@@ -631,6 +631,34 @@ def test_powers_that_are_the_series_of_a_shape_give_way_to_it():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("force", ["toda", "inverse square"])
+def test_a_force_between_two_bodies_is_found_with_the_errors_of_its_numbers(force):
+    """Each on a spring of its own, told nothing: the number inside the shape is fitted too, and the
+    standard errors of the coefficients say so."""
+    rng = np.random.default_rng([11, len(force)])
+    k, mass, t = rng.uniform(0.3, 1.0, 2), rng.uniform(0.7, 1.5), 0.04 * np.arange(1500)
+    a, depth = rng.uniform(0.6, 1.2), rng.uniform(0.4, 1.0)
+
+    def rates(_, z):
+        apart = z[1] - z[0]
+        push = a * (np.exp(-a * apart) - 1) if force == "toda" else 1 / (2 + apart) ** 2 - 0.25
+        return [*z[2:], -k[0] * z[0] - depth * push, (-k[1] * z[1] + depth * push) / mass]
+
+    q = solve_ivp(rates, (0, 60), [-0.7, 0.8, 0, 0], t_eval=t, rtol=1e-10).y[:2]
+    x, y = q + 1e-3 * np.std(q, axis=1, keepdims=True) * rng.normal(size=q.shape)
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x, "y": y}, positions=["x", "y"]))
+    toda = force == "toda"
+    truth = {"x**2": -k[0] / 2, "y**2": -k[1] / 2, "y_dot**2": mass / 2}
+    truth["shape"] = -depth if toda else -depth / 2
+    truth["x"] = a * depth if toda else depth / 4
+    truth["y"] = -truth["x"]
+    known = {row.term if row.term in truth else "shape": row for row in fit.lagrangian.terms[1:]}
+    assert set(known) == set(truth)
+    apart = [(known[name].coefficient - truth[name]) / known[name].std for name in truth]
+    assert np.max(np.abs(apart)) < 4
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(given):
     """Found among all terms, and where the textbook's own are given; rollouts are those of the

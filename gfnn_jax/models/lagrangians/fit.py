@@ -741,20 +741,30 @@ class LawFit:
         return dict(zip(new, scores.tolist(), strict=True))
 
     def along(
-        self, changes: Mapping[Key, float], larger: Structure, problem: ArcProblem | None = None
+        self,
+        changes: Mapping[Key, float],
+        larger: Structure,
+        problem: ArcProblem | None = None,
+        least: float | None = None,
     ) -> tuple[float, float]:
         """The number whose change moves further coefficients (of a ``larger`` structure) by these
         ``changes`` that fits best, to first order, and its standard error; 0 and NaN where the
-        fitted ones imitate it."""
+        fitted ones imitate it up to the share ``least``."""
+        whole = self.beside(changes, larger, problem)
+        found = whole.added(range(len(whole.p) - 1), [len(whole.p) - 1])
+        if not found.share[0] > (least or self.problem.options.imitated):
+            return 0.0, np.nan
+        return float(found.value[0]), float(np.sqrt(self.correlation) / found.size[0])
+
+    def beside(
+        self, changes: Mapping[Key, float], larger: Structure, problem: ArcProblem | None = None
+    ) -> Linearised:
+        """The problem of the fit and, the last coefficient, of the number that `along` is of."""
         own, others = places(larger, self.structure, list(changes))
         turn = np.zeros((len(larger.keys()), len(own) + 1))
         turn[own, range(len(own))] = 1.0
         turn[others, -1] = list(changes.values())
-        whole = (problem or self.problem).linearised(larger, self).combined(turn)
-        found = whole.added(range(len(own)), [len(own)])
-        if not found.share[0] > self.problem.options.imitated:
-            return 0.0, np.nan
-        return float(found.value[0]), float(np.sqrt(self.correlation) / found.size[0])
+        return (problem or self.problem).linearised(larger, self).combined(turn)
 
 
 class FoldFit(NamedTuple):

@@ -30,6 +30,7 @@ from gfnn_jax.models.lagrangians.learned_law import (
 )
 from gfnn_jax.models.lagrangians.next_motion import Motion
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness, whiteness
+from gfnn_jax.models.lagrangians.rivals import widened
 from gfnn_jax.models.lagrangians.structure import Structure, is_constant
 from gfnn_jax.models.lagrangians.text import (
     Names,
@@ -168,9 +169,11 @@ def _standard_errors(
     """Standard errors of the terms of L, of R, of the gains (d, m), and of the last coefficient,
     the rate γ of uniform friction where there is one; NaN of terms that are not determined."""
     std = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
-    law, open_ = best.law, best.fit.undetermined
+    law, open_, wider = best.law, best.fit.undetermined, widened(best.fit)
     of_terms, of_losses, rest = np.split(std, np.cumsum([law.terms.count, law.friction.count]))
-    of_terms[[("term", row) in open_ for row in best.fit.structure.terms]] = np.nan
+    rows = [("term", row) for row in best.fit.structure.terms]
+    of_terms *= [wider.get(row, 1.0) for row in rows]
+    of_terms[[row in open_ for row in rows]] = np.nan
     return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
 
 

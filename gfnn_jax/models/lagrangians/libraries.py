@@ -9,8 +9,11 @@ asks for.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, permutations
+
+import numpy as np
 
 from gfnn_jax.families.expressions import parse, product_of, to_text
 from gfnn_jax.families.friction import (
@@ -41,6 +44,7 @@ SHAPES = (  # of a length q, of which powers may be the series
     "exp(A*q) + exp(-A*q)",
     "cos(A*q) + sin(A*q)",
     "sqrt(1+(A*q)**2) + q",
+    "1/(1+A*q) + q",
 )
 GAINS = ("1/(1+A*q)", "1/(1+A*q)**2", "exp(A*q)")  # by which a force of inputs depends on q
 
@@ -241,13 +245,20 @@ def central(dim: int, exponent: float) -> list[Row]:
     return [(none, none, none, 0.0, shape), *fields]
 
 
-def shaped(shape: str, constant: float, times: str = "1") -> list[Row]:
-    """The potentials of the one coordinate that a sum of `SHAPES` is of, with this constant A,
-    ``times`` a function of inputs."""
-    texts = [text.replace("A", f"({constant:.8g})") for text in shape.split(" + ")]
-    trees = [tree_of(times, 1) * tree_of(text, 1) for text in texts]
-    shapes: list[Row] = [((0,), (0,), (0,), 0.0, to_text(one, 1, INPUTS)) for one in trees]
-    return [((0,), (1,), (0,), 0.0) if row[4] == "q1" else row for row in shapes]
+def shaped(shape: str, constant: float, along: Sequence[int], times: str = "1") -> list[Row]:
+    """The potentials that a sum of `SHAPES` is of, with this constant A, of the coordinate that is
+    1 in ``along``, less the one that is −1; ``times`` a function of inputs."""
+    d, names = len(along), {1: "", -1: ""}
+    names |= {sign: f"q{i + 1}" for i, sign in enumerate(along) if sign}
+    length = f"({names[1]}-{names[-1]})" if names[-1] else names[1]
+    plain = potentials(d, np.flatnonzero(along), 1)
+    rows: list[Row] = []
+    for text in shape.split(" + "):
+        own = re.sub(r"\bq\b", length, text.replace("A", f"({constant:.8g})"))
+        tree = tree_of(times, d) * tree_of(own, d)
+        one: Row = ((0,) * d, (0,) * d, (0,) * d, 0.0, to_text(tree, d, INPUTS))
+        rows += plain if text == "q" and times == "1" else [one]
+    return rows
 
 
 def springs(dim: int, angles: Sequence[int]) -> list[Row]:

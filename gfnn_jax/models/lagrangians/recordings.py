@@ -468,16 +468,14 @@ def _options(friction: str) -> SearchOptions:
 
 
 def _with_constants(fit: LawFit) -> list[str]:
-    """A message where a search has found numbers inside of shapes of the one coordinate."""
-    some = fit.structure.terms if fit.structure.dim == 1 else ()
-    shapes = [row for row in some if constants(row)]
+    """A message where a search has found numbers inside of shapes."""
+    shapes = [row for row in fit.structure.terms if constants(row)]
     if not shapes:
         return []
     constant, _, error = constant_of(fit)
     return [
         f"the number {measured(constant, abs(constant) * error)} inside "
-        f"{fit.problem.word(('term', shapes[-1]))} is fitted too: standard errors of the other "
-        "coefficients are with it as it is"
+        f"{fit.problem.word(('term', shapes[-1]))} is fitted too"
     ]
 
 

@@ -14,6 +14,8 @@ import dataclasses
 import shlex
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
+from gfnn_jax.fitting.evidence import improved
 from gfnn_jax.maps.observation import observed
 from gfnn_jax.models.lagrangians.exchange import may_be_chosen
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, places
@@ -44,6 +47,7 @@ from gfnn_jax.models.lagrangians.libraries import (
     springs,
     textbook,
     torques,
+    without_forces,
 )
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
@@ -55,8 +59,10 @@ class RivalOptions:
 
     most: powers of the distance to either side. series: potentials, from which on they may be the
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
-    apart: relative, over which it is differentiated; corrections: of it; furthest: relative, of
-    each; settled: standard errors, within which it is found. noise: times it, that is no more;
+    finer: between half and twice the best of them; apart: relative, over which it is
+    differentiated; imitated: share of what it changes that no coefficient does, below which it is
+    not known; corrections: of it; furthest: relative, of each; settled: standard errors,
+    within which it is found. noise: times it, that is no more;
     fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
     as_fast: relative, within which it is found. clearly: of Schwarz's
     criterion, that a sensor gains where a law leaves more; explains: of what that law leaves, the
@@ -67,7 +73,9 @@ class RivalOptions:
     most: int = 4
     series: int = 3
     constants: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    finer: int = 9
     apart: float = 1e-4
+    imitated: float = 1e-4
     corrections: int = 6
     furthest: float = 0.3
     settled: float = 0.1
@@ -187,41 +195,117 @@ def with_viscous_as_it_fades(fit: LawFit) -> LawFit:
 
 
 def with_a_shape(fit: LawFit) -> LawFit:
-    """The fit of one length with a shape (`libraries.SHAPES`) in place of its powers, or beside
-    springs in place of the powers that inputs are multiplied by, where that is likelier than these,
-    and than any other shape, by odds that decide."""
-    structure, count = fit.structure, fit.independent
-    potentials = [row for row in structure.terms if not any(row[0])]
-    driven = Counter(shape_of(row) for row in potentials if has_inputs(row))
-    of_inputs, many = driven.most_common(1)[0] if driven else ("1", len(potentials))
-    fewest = 2 if driven else OPTIONS.series
-    if structure.dim > 1 or fit.problem.angles or many < fewest or not fit.follows:
-        return fit
-    units = np.array(OPTIONS.constants) / np.ptp(fit.problem.states[:, 0])
+    """The fit of lengths with a shape (`libraries.SHAPES`) of one of them, or of the distance of
+    two, in place of its powers, or beside springs in place of the powers that inputs are multiplied
+    by, where that is likelier than these, by odds that decide, and than any other shape with as few
+    coefficients."""
+    structure, d = fit.structure, fit.structure.dim
+    own = [row for row in structure.terms if not any(row[0])]
+    driven = Counter(shape_of(row) for row in own if has_inputs(row))
     kept = tuple(row for row in structure.terms if any(row[0]) and is_constant(row))
-    kept += (*torques(1, [0]), *springs(1, [0])) if driven else ()
-    found = [(fit.criterion(), "", fit)]
-    for name in GAINS if driven else SHAPES:
-
-        def of(a: float, name: str = name) -> Structure:
-            return dataclasses.replace(structure, terms=(*kept, *shaped(name, a, of_inputs)))
-
-        def share(a: float, of=of) -> float:
-            return weak_share(of(a), fit.problem)
-
-        begun = min((units * side for side in (1, -1)), key=lambda row: min(map(share, row)))
-        near = min(begun, key=share)
-        ends = sorted((near / 2, near * 2))
-        least_at: Any = minimize_scalar(share, bounds=ends, method="bounded")
-        other = with_constant(fit.again(of(float(least_at.x)), rescale=False), False)
-        if other.follows and other.is_definite:
-            found.append((other.criterion(count) + np.log(count), name, other))
-    (least, name, best), *others = sorted(found, key=lambda one: one[0])
-    decide = fit.problem.options.evidence.deciding
-    if best is fit or min(one[0] for one in others) < least + decide:
+    if driven:
+        times, many = driven.most_common(1)[0]
+        tried = _Shapes(fit, (*kept, *torques(1, [0]), *springs(1, [0])), (), times)
+    else:
+        series = own if d == 1 else [row for row in own if sum(row[1]) > 2]
+        shifted, many = fit.problem.observation.shifts(), len(series)
+        plain = () if d == 1 else without_forces(potentials(d, range(d), 1, 2), shifted)
+        tried = _Shapes(fit, kept, plain, "1")
+    alone = many >= (2 if driven else OPTIONS.series) and not (driven and d > 1)
+    if not alone or fit.problem.angles or not fit.follows:
         return fit
+    lengths = [(1,)] if d == 1 else _lengths_of(series)
+    shapes = product(GAINS if driven else SHAPES, lengths)
+    begun = {one: tried.nearest(*one) for one in shapes}
+    (_, length), _ = min(begun.items(), key=lambda one: one[1][1])
+    found = [(fit.criterion(), "", fit)]
+    for (name, along), (near, _) in begun.items():
+        other = tried.fitted(name, along, near) if along == length else None
+        if other is not None:
+            found.append((other.criterion(fit.independent) + np.log(fit.independent), name, other))
+    least = min(cost for cost, _, _ in found) + fit.problem.options.evidence.deciding
+    near = [(len(one.p), name, one) for cost, name, one in found if cost < least]
+    fewest = [one for one in near if one[0] == min(near, key=lambda one: one[0])[0]]
+    if any(one is fit for *_, one in near) or len(fewest) > 1:
+        return fit
+    (_, name, best), *_ = fewest  # others as likely have a term more
     fit.problem.on_progress(f"  {name} in place of {many} powers")
     return best.again()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shapes:
+    """Shapes of a length in place of powers in the law of a fit.
+
+    kept: terms of the law beside them. plain: powers of degree 1 and 2 that may stand beside them
+    too, but for that which makes a spring of the length. times: a function of inputs by which the
+    shape is multiplied.
+    """
+
+    fit: LawFit
+    kept: tuple[Row, ...]
+    plain: tuple[Row, ...]
+    times: str
+
+    def structure(self, name: str, along: Sequence[int], constant: float) -> Structure:
+        """The terms with this shape of the length ``along``, as `libraries.shaped` has it."""
+        ends = tuple(map(bool, along))
+        beside = [row for row in self.plain if sum(row[1]) < 2 or tuple(map(bool, row[1])) != ends]
+        terms = (*self.kept, *beside, *shaped(name, constant, along, self.times))
+        return dataclasses.replace(self.fit.structure, terms=tuple(dict.fromkeys(terms)))
+
+    def left(self, name: str, along: Sequence[int], constant: float) -> float:
+        """Share of the squares of the equations of motion that it leaves."""
+        equal = len(along) == 1
+        return weak_share(self.structure(name, along, constant), self.fit.problem, equal)
+
+    def nearest(self, name: str, along: Sequence[int]) -> tuple[float, float]:
+        """The constant of a few that leaves least, and what it leaves."""
+        q = self.fit.problem.states[:, : len(along)] @ np.array(along)
+        sizes = np.array(OPTIONS.constants) / np.ptp(q)
+        tried = {a: self.left(name, along, a) for a in (*sizes, *-sizes)}
+        return min(tried.items(), key=lambda one: one[1])
+
+    def fitted(self, name: str, along: Sequence[int], near: float) -> LawFit | None:
+        """The fit with the constant that is likeliest near this one, without the plain terms that
+        are not likely; None where no orbit follows."""
+        finer = near * np.geomspace(0.5, 2.0, OPTIONS.finer)  # beyond some a shape may be singular
+        at = int(np.argmin([self.left(name, along, a) for a in finer]))
+        ends = sorted(finer[[max(at - 1, 0), min(at + 1, len(finer) - 1)]])
+        left = partial(self.left, name, along)
+        least_at: Any = minimize_scalar(left, bounds=ends, method="bounded")
+        structure = self.structure(name, along, float(least_at.x))
+        structure, known = weak_start(structure, self.fit.problem, False)
+        fit = with_constant(self.fit.again(structure, known, rescale=False), False)
+        if not (fit.follows and fit.is_definite):
+            return None
+        free = [("term", row) for row in self.plain]
+        constant = {key for key in free if sum(key[1][1]) == 1}  # pull and are pulled: a pair
+
+        def least_seen(fit: LawFit) -> list[frozenset[Key]]:
+            z = fit.significance
+            own = sorted((key for key in free if key in z), key=lambda key: z[key])
+            return [frozenset({key}) for key in own] + [frozenset(constant & set(own))]
+
+        def without(fit: LawFit, keys: frozenset[Key]) -> LawFit | None:
+            smaller = fit.structure.without(set(keys))
+            less = with_constant(fit.again(smaller, rescale=False), False)
+            likelier = less.criterion(fit.independent) < fit.criterion()
+            return less if less.follows and likelier else None
+
+        return improved(fit, least_seen, without)
+
+
+def _lengths_of(rows: Sequence[Row]) -> list[tuple[int, ...]]:
+    """The lengths that powers may be a series in: the coordinate of a term, or the difference of
+    its two."""
+    found: dict[tuple[int, ...], None] = {}
+    for row in rows:
+        along = [0] * len(row[1])
+        for axis, sign in zip(np.flatnonzero(row[1]), (1, -1), strict=False):
+            along[axis] = sign
+        found[tuple(along)] = None
+    return list(found)
 
 
 def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
@@ -242,18 +326,37 @@ def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
 def constant_of(fit: LawFit) -> tuple[float, float, float]:
     """The number inside the last shape of a law, 0 where there is none, its relative change that
     fits best, and the standard error of that; NaN where the coefficients imitate it."""
-    d, changes, numbers = fit.structure.dim, {}, [0.0]
+    number, changes = _by_constant(fit)
+    if not changes or not fit.follows:
+        return number, 0.0, np.nan
+    larger = fit.structure.plus(list(changes))
+    return number, *fit.along(changes, larger, least=OPTIONS.imitated)
+
+
+def widened(fit: LawFit) -> dict[Key, float]:
+    """The factor, of each coefficient, by which its standard error is larger since the number
+    inside shapes is not known either; none where there is no such number."""
+    _, changes = _by_constant(fit)
+    if not changes or not fit.follows:
+        return {}
+    whole = fit.beside(changes, fit.structure.plus(list(changes)))
+    alone = whole.among(range(len(whole.p) - 1))
+    return dict(zip(fit.structure.keys(), (whole.errors[:-1] / alone.errors).tolist(), strict=True))
+
+
+def _by_constant(fit: LawFit) -> tuple[float, dict[Key, float]]:
+    """The number inside the last shape of a law, 0 where there is none, and what a relative change
+    of it adds: terms, with coefficients."""
+    d, changes, last = fit.structure.dim, dict[Key, float](), 0.0
     for row in fit.structure.terms:
         if own := constants(row):
-            numbers = [*own, *numbers]
+            last = own[0]
             more, less = (
                 tree_of(shape_of(_scaled(row, 1 + by)), d) for by in (OPTIONS.apart, -OPTIONS.apart)
             )
             slope = to_text((more - less) * (0.5 / OPTIONS.apart), d, INPUTS)
             changes["term", (*row[:4], slope, *row[5:])] = fit.values["term", row]
-    if not changes or not fit.follows:
-        return numbers[0], 0.0, np.nan
-    return numbers[0], *fit.along(changes, fit.structure.plus(list(changes)))
+    return last, changes
 
 
 def constants(row: Row) -> list[Any]:

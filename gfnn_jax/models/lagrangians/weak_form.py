@@ -116,10 +116,10 @@ class _Equations(NamedTuple):
         return cls(keys, X, Y, keep, masses, windows.mean(windows.t))
 
 
-def weak_share(structure: Structure, problem: ArcProblem) -> float:
-    """Share of the squares of the equations of motion that all terms of a structure, with equal
-    masses, leave."""
-    _, X, Y, keep, *_ = _Equations.of(structure, problem, True)
+def weak_share(structure: Structure, problem: ArcProblem, equal: bool = True) -> float:
+    """Share of the squares of the equations of motion that all terms of a structure, with ``equal``
+    masses or masses of their own, leave."""
+    _, X, Y, keep, *_ = _Equations.of(structure, problem, equal)
     return _share(X[..., keep], Y)
 
 
