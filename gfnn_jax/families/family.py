@@ -171,11 +171,6 @@ class AroundAnother(OfCoefficients):
         return self.family.term_names
 
     @property
-    def quadratic(self) -> bool:
-        """Return whether the field is affine."""
-        return self.family.quadratic
-
-    @property
     def operations(self) -> tuple[int, int]:
         """Floating-point operations of a gradient, and of a gradient with its Hessian."""
         return self.family.operations

@@ -215,7 +215,6 @@ class Sums(OfCoefficients):
     parts: tuple[Part, ...]
 
     name = "sums"
-    quadratic = False  # no affine map is tried in its stead: a dense matrix
 
     @property
     def num_parameters(self) -> int:

@@ -21,7 +21,6 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import (
     Expression,
     coordinate,
-    coordinate_names,
     count_operations,
     depends_on,
     parse,
@@ -147,12 +146,6 @@ class Terms(OfCoefficients):
         if self.names:
             return [parse_named(text, self.names, self.parameters) for text in self.variables]
         return [parse(text, self.dim, self.parameters) for text in self.variables]
-
-    @property
-    def quadratic(self) -> bool:
-        """True where every term is a coordinate or a product of two: the gradient is affine."""
-        plain = set(self.variables) <= set(coordinate_names(self.dim))
-        return plain and all(sum(row) <= 2 for row in self.powers)
 
     @property
     def _plan(self) -> _Plan:

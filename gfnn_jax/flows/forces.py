@@ -17,7 +17,7 @@ import numpy as np
 
 from gfnn_jax.arrays import as_row, beside, matmul, namespace, pytree
 from gfnn_jax.families.family import AroundAnother, at_time, parameter_gradients
-from gfnn_jax.families.friction import LINEAR, Friction
+from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.lagrangian import pushed
 from gfnn_jax.phase_space import split
 
@@ -79,11 +79,6 @@ class Forced(WithForces):
     def _driven(self) -> bool:
         """Return whether terms of H have inputs."""
         return getattr(getattr(self.family, "terms", None), "driven", False)
-
-    @property
-    def quadratic(self) -> bool:
-        """Return whether the field is affine."""
-        return self.family.quadratic and not np.any(self.friction.kinds != LINEAR)
 
     @property
     def operations(self) -> tuple[int, int]:

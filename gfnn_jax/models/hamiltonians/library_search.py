@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.coordinates import to_user
-from gfnn_jax.dataset.measured_error import FEW, OneStepError, measured_error
+from gfnn_jax.dataset.measured_error import FEW
 from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.sums import matrix_free
@@ -53,7 +52,7 @@ def small_libraries(problem: LawProblem) -> dict[int, FittedLaw]:
     They are soon fitted, at steps too long for the matching of atoms too, and the search goes on
     from them.
     """
-    laws = _laws(problem, _libraries(problem)[0], most=problem.options.small)
+    laws = _laws(problem, _libraries(problem), most=problem.options.small)
     fitted: dict[int, FittedLaw] = {}
     with contextlib.suppress(OutOfTime):  # whatever follows finds no time either
         for left, law in laws:
@@ -97,35 +96,29 @@ def _searched(
     problem: LawProblem, forces: Forces | None = None, early: Mapping[int, FittedLaw] = NONE
 ) -> FittedLaw:
     """The smallest library that meets the tolerance, else the best; no fewer of its terms are tried
-    where the tolerance is out of reach. forces: friction, that libraries have too.
-    early: the first libraries, where these are fitted already."""
+    where libraries ended while each was better than the one before. forces: friction, that
+    libraries have too. early: the first libraries, where these are fitted already."""
     options = problem.options
     in_kind = problem.data.structure is not None or problem.of_modes  # libraries differ
     most_poor = options.poor_given if problem.terms else options.poor
     most_poor = options.poor_in_kind if in_kind and forces is None else most_poor
     tried: list[FittedLaw] = []
-    poor, no_law = 0, False
-    libraries, errors = _libraries(problem, forces)
+    poor = 0
     try:
-        for left, law in _laws(problem, libraries, early):
+        for _, law in _laws(problem, _libraries(problem, forces), early):
             before = min((t.error.relative for t in tried), default=np.inf)
             poor = 0 if not tried or law.error.relative < options.gained * before else poor + 1
             tried.append(law)
-            errors.append(law.error.bound)
             if problem.met_by(_best(problem, tried)) or poor == most_poor:
-                break
-            no_law = not in_kind and options.only_within
-            no_law = no_law and _out_of_reach(errors, left, problem.tolerance.bound)
-            if no_law:
                 break
     except OutOfTime:
         if not tried:
             raise
     best = _best(problem, tried)._replace(stalled=poor == most_poor)
-    if no_law:  # nothing to read
-        best = best._replace(thresholds=())
     if problem.met_by(best):
         return best
+    if options.only_within and not in_kind and not best.stalled and len(tried) > 2:
+        best = best._replace(thresholds=())  # a series that goes on: nothing to read
     best = simplest_where_few_decide(problem, tried, best)
     found = _simplest_within_noise(problem, tried, best)
     return found._replace(stalled=True) if found.noisy else found
@@ -173,18 +166,11 @@ def _simplest_within_noise(
     )
 
 
-def _libraries(problem: LawProblem, forces: Forces | None = None) -> tuple[list[Any], list[float]]:
-    """Libraries by rising size, and the errors of those before them that are known to be hopeless
-    without a fit."""
-    data = problem.data
+def _libraries(problem: LawProblem, forces: Forces | None = None) -> list[Any]:
+    """Libraries by rising size."""
     libraries = [f if forces is None else forces(f) for f in libraries_of(problem)]
-    if isinstance(data.structure, Bodies):
-        return promising(libraries, data), []
-    if len(libraries) > 1 and libraries[0].quadratic and not data.varied:
-        affine = affine_error(problem).bound
-        if affine > problem.options.hopeless * problem.tolerance.bound:
-            return libraries[1:], [affine]
-    return libraries, []
+    of_bodies = isinstance(problem.data.structure, Bodies)
+    return promising(libraries, problem.data) if of_bodies else libraries
 
 
 def _walked(problem: LawProblem) -> FittedLaw:
@@ -223,31 +209,6 @@ def _walked(problem: LawProblem) -> FittedLaw:
     if problem.met_by(best):
         return best
     return _simplest_within_noise(problem, tried, best._replace(stalled=stalled))
-
-
-def affine_error(problem: LawProblem) -> OneStepError:
-    """The held-out error of the affine map that is closest to the training pairs: that of a
-    quadratic H, whose flow is affine, is hardly smaller."""
-    data = problem.data
-
-    def design(rows):
-        z = data.y0[rows] / data.scale
-        return np.column_stack([np.ones(len(z)), z])
-
-    moved = data.y1 - data.y0
-    rows = data.training[: problem.options.affine_rows]
-    known = np.linalg.lstsq(design(rows), moved[rows], rcond=None)[0]
-    found = data.y0[data.validation] + design(data.validation) @ known
-    return measured_error(data, problem.tolerance, to_user(data.coordinates, found))
-
-
-def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
-    """Return whether the libraries that are left, each gaining as much as the best of the last two
-    gains, would still miss the bound."""
-    if len(errors) < 3 or not np.isfinite(errors[-3:]).all():
-        return False
-    gain = min(errors[-1] / errors[-2], errors[-2] / errors[-3], 1.0)
-    return errors[-1] * gain**left > bound
 
 
 def exceeds_cost(problem: LawProblem, family, last: FittedLaw) -> bool:

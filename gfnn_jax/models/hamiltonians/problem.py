@@ -39,23 +39,21 @@ class LawOptions:
     flat: libraries one after the other whose errors differ by less have met the pairs' noise.
     gained: a library that lowers the error by less has not helped; gained_alone: where noise hides
     what it brings. poor: such libraries in a row that end the search; poor_given: of a user's
-    terms; poor_in_kind: of a structure or of modes, whose libraries differ in kind. hopeless:
-    times the tolerance, of an error that is known before a library is fitted, by an affine map of
-    affine_rows training pairs. small: terms of the libraries that are tried before laws of physics,
-    0.3 s of two bodies; exact: of the spread, what a polynomial errs by that is no approximation.
-    on_branch: of the spread, an error below which is that of the right branch of the turns, which
-    turning pairs tell. truncation: a flow's own error, as a part of the tolerance. generators:
-    degrees of those that look for misfit, beside the one that is so far ``beyond`` the law's own:
-    an even H lacks no odd terms; sampled_rows: per term, where what is left over is looked at,
-    fewest_sampled: pairs at least, of many sites numbers; white_pairs: whose residuals say whether
-    a law leaves anything but noise. max_operations: of the flows that are evaluated on the way,
-    counted: what a quiet core makes in half a minute, at 5e8 a second (two bodies, three bodies,
-    pendulums), within which all laws of the benchmarks are found that are found at all;
-    mode_operations: the same where there are angles, a minute at 7e8 a second, for a double
-    pendulum's L.
+    terms; poor_in_kind: of a structure or of modes, whose libraries differ in kind. small: terms
+    of the libraries that are tried before laws of physics, 0.3 s of two bodies; exact: of the
+    spread, what a polynomial errs by that is no approximation. on_branch: of the spread, an error
+    below which is that of the right branch of the turns, which turning pairs tell. truncation: a
+    flow's own error, as a part of the tolerance. generators: degrees of those that look for misfit,
+    beside the one that is so far ``beyond`` the law's own: an even H lacks no odd terms;
+    sampled_rows: per term, where what is left over is looked at, fewest_sampled: pairs at least, of
+    many sites numbers; white_pairs: whose residuals say whether a law leaves anything but noise.
+    max_operations: of the flows that are evaluated on the way, counted: what a quiet core makes in
+    half a minute, at 5e8 a second (two bodies, three bodies, pendulums), within which all laws of
+    the benchmarks are found that are found at all; mode_operations: the same where there are
+    angles, a minute at 7e8 a second, for a double pendulum's L.
     evaluations: of the flow and its derivatives, that a fit of a library is expected to take;
     close: of terms that are known to be close to their optimum. only_within: whether a law that
-    misses the tolerance is of no use, so that the search ends where it is out of reach.
+    misses the tolerance is of no use.
     roundoff: of the spread, above it the pairs carry noise, and every one of them counts;
     near_roundoff: of a flow's own error.
     fast: of ωh, from here on other laws are not far from the same pairs. contracting: a fixed
@@ -87,8 +85,6 @@ class LawOptions:
     poor: int = 2
     poor_given: int = 3
     poor_in_kind: int = 5
-    hopeless: float = 10.0
-    affine_rows: int = 50_000
     small: int = 35
     exact: float = 1e-13
     on_branch: float = 0.05
