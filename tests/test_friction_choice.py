@@ -182,3 +182,17 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
     assert likeliest(tried)[0] is one
     assert likeliest([(two, None), (last, None)])[0] is two
     assert likeliest([(drives, None), (lost, None)])[0] is lost  # none can be: the last
+
+
+@pytest.mark.parametrize(
+    ("seed", "damping", "kinds"), [(3, 0.002, ("linear",)), (4, 0.002, ("linear",)), (3, 0.0, ())]
+)
+def test_friction_that_adds_up_over_a_short_record(seed, damping, kinds):
+    """Six periods of a spring whose readings are averages of five. Each third begins with a state
+    of its own, and two periods show too little of friction: held-out thirds chose none."""
+    t = np.arange(150) * 2 * np.pi / 25
+    noise = np.random.default_rng(seed).normal(size=len(t) + 4)
+    smoothed = np.convolve(noise, np.ones(5) / np.sqrt(5), "valid")
+    x = np.exp(-damping * t) * np.cos(t) + 0.01 * smoothed
+    found = gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+    assert found.which_friction.kinds == kinds

@@ -26,7 +26,8 @@ coefficients miss on the arcs that they are not from. Where there is a choice, a
 taken only where each of its coefficients, found from all arcs, is seen: it lowers Schwarz's
 criterion, which of n independent residuals, n large, asks for z² > log n, z in standard errors.
 Chance can still hide friction that is there, where held-out arcs are those that alone determine
-another coefficient.
+another coefficient. So can thirds of a short record, too short for what adds up over all of it: the
+search asks its whole arcs (`search`).
 """
 
 from __future__ import annotations
@@ -155,6 +156,13 @@ def _in_isotropic(kinds: Sequence[int]) -> tuple[int, ...]:
     return tuple(sorted({*kinds, ISOTROPIC} - {QUADRATIC})) if QUADRATIC in kinds else ()
 
 
+def plainness(kinds: Sequence[int]) -> tuple[float, ...]:
+    """The rank of kinds among as many others: uniform friction first, and isotropic drag, which has
+    one coefficient, before quadratic friction."""
+    order = {UNIFORM: -1.0, ISOTROPIC: LINEAR + 0.5}
+    return tuple(sorted(order.get(kind, kind) for kind in kinds))
+
+
 def is_coupled(row: Loss) -> bool:
     """Return whether a friction is of the sum or the difference of several speeds."""
     return row[1] != ISOTROPIC and sum(map(bool, row[0])) > 1
@@ -176,13 +184,6 @@ class _Judged:
     @property
     def kinds(self) -> tuple[int, ...]:
         return kinds_of(self.rows)
-
-    @property
-    def plainness(self) -> tuple[float, ...]:
-        """The rank of its kinds among as many others: uniform friction first, and isotropic drag,
-        which has one coefficient, before quadratic friction."""
-        order = {UNIFORM: -1.0, ISOTROPIC: LINEAR + 0.5}
-        return tuple(sorted(order.get(kind, kind) for kind in self.kinds))
 
     @functools.cached_property
     def cost(self) -> float:
@@ -271,7 +272,7 @@ def chosen(
     plain = {s.kinds for s in tied if ISOTROPIC in s.kinds}  # of one coefficient for several
     tied = [s for s in tied if _in_isotropic(s.kinds) not in plain]
     known = before.kinds if before else ()
-    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.plainness))
+    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, plainness(s.kinds)))
     if choose:
         lowest = taken.criterion - 2 * np.log(EVIDENCE.decided)
         likelier = [s for s in _with_rare(table, taken) if s.criterion < lowest]

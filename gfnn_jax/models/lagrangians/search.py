@@ -34,7 +34,14 @@ from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.exchange import may_be_chosen, with_exchanges
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
-from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, kinds_of, table_of
+from gfnn_jax.models.lagrangians.friction_choice import (
+    FrictionChoice,
+    chosen,
+    is_coupled,
+    kinds_of,
+    plainness,
+    table_of,
+)
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.rivals import (
@@ -424,7 +431,8 @@ class TermSearch:
         """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as
         long as those of the fit, or as long as three of them can be. A choice holds close to its
         fit, so that it is made again until it stands; where none has stood when the third is looked
-        at, the likeliest of these fits is taken."""
+        at, the likeliest of these fits is taken. Longer arcs of the fit then see more
+        (`_with_more_along`)."""
         if self.frictions is None:
             return fit, FrictionChoice(fit.structure.friction, {}, {}, gains=False)
         problem, options, begun = fit.problem, fit.problem.options, fit
@@ -456,8 +464,14 @@ class TermSearch:
         rows = fit.structure.friction
         if set(choice.rows) != set(rows):
             choice = chosen(table_of(fit, frictions), options.choose_friction, rows=rows)
-        fit = without_drives(begun.again(fit.structure, fit.values))
-        return fit, choice._replace(rows=fit.structure.friction)
+        along = without_drives(begun.again(fit.structure, fit.values))
+        if options.choose_friction and length < along.arcs.t.shape[1]:
+            whole = _with_more_along(along, frictions)
+            if whole is not along:
+                table = table_of(fit.again(whole.structure, whole.values), frictions)
+                choice = chosen(table, rows=whole.structure.friction)._replace(odds={})
+            along = whole
+        return along, choice._replace(rows=along.structure.friction)
 
 
 def _with_more_beside_a_load(fit: LawFit, frictions: Sequence[Loss]) -> LawFit:
@@ -479,6 +493,34 @@ def _with_more_beside_a_load(fit: LawFit, frictions: Sequence[Loss]) -> LawFit:
         return [row for row in rows if libraries.together((*kinds, row[1]))]
 
     return improved(fit, missing, likelier)
+
+
+def _with_more_along(fit: LawFit, frictions: Sequence[Loss]) -> LawFit:
+    """The fit with the usual friction that its arcs show and thirds of the record do not, by odds
+    that decide; of what is about as likely the plainest. What friction takes adds up, and each
+    third of a short record begins with a state of its own."""
+    evidence = fit.problem.options.evidence
+
+    def likelier(here: LawFit) -> list[tuple[Loss, float, LawFit]]:
+        kinds = {row[1] for row in here.structure.friction}
+        usual = [row for row in frictions if not kind_of(row[1]).rare]
+        rows = [row for row in usual if libraries.together((*kinds, row[1]))]
+        z = here.scores(here.structure.plus([("loss", row) for row in rows]))
+        least, found = np.log(here.independent) + evidence.deciding, []
+        for key in (key for key in z if z[key] ** 2 > least):
+            other = here.again(here.structure.plus([key]), rescale=False)
+            gain = here.criterion() - other.criterion(here.independent)
+            if may_be_chosen(other) and gain > evidence.deciding:
+                found.append((key[1], gain, other))
+        return found
+
+    while fit.follows and (found := likelier(fit)):
+        most = max(gain for _, gain, _ in found)
+        tied = [one for one in found if one[1] > most - evidence.deciding]
+        row, _, other = min(tied, key=lambda one: (is_coupled(one[0]), plainness([one[0][1]])))
+        fit.problem.on_progress(f"  friction: {fit.problem.word(('loss', row))}, along whole arcs")
+        fit = other.again()
+    return fit
 
 
 def with_a_spring(fit: LawFit, angle: int) -> LawFit:
