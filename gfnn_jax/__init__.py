@@ -12,37 +12,46 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gfnn_jax import records, scenes
-    from gfnn_jax.brackets import Bracket
-    from gfnn_jax.compiling import enable_compile_cache
-    from gfnn_jax.data.recording import Recording, read
-    from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
-    from gfnn_jax.evaluate import figures, metrics
-    from gfnn_jax.evaluate.discover import discover
-    from gfnn_jax.exports.export import export
-    from gfnn_jax.families import from_function
-    from gfnn_jax.families.functions import register_function
-    from gfnn_jax.generating.charts import CHARTS, Chart
-    from gfnn_jax.learn.fit import fit
-    from gfnn_jax.learn.fitted import Fit
-    from gfnn_jax.learn.monitors import Monitors, fit_monitors
-    from gfnn_jax.learn.options import (
-        FitOptions,
-        GeneratingFunction,
-        Hamiltonian,
-        Lagrangian,
-        between,
-    )
-    from gfnn_jax.learn.saved import load
-    from gfnn_jax.maps.saved import register
-    from gfnn_jax.maps.stroboscopic import stroboscopic
-    from gfnn_jax.maps.symplectic_map import SymplecticMap
-    from gfnn_jax.models.arms.arm import Arm
-    from gfnn_jax.models.model import Fitted, TrainingData
-    from gfnn_jax.phase_space import Pairs
-    from gfnn_jax.scenes import Scene
-    from gfnn_jax.scenes.draws import sample_pairs, sample_states, sample_test_states
-    from gfnn_jax.scenes.trajectories import reference_trajectories
+    from gfnn_jax import records as records
+    from gfnn_jax import scenes as scenes
+    from gfnn_jax.brackets import Bracket as Bracket
+    from gfnn_jax.compiling import enable_compile_cache as enable_compile_cache
+    from gfnn_jax.data.recording import Recording as Recording
+    from gfnn_jax.data.recording import read as read
+    from gfnn_jax.errors import FitError as FitError
+    from gfnn_jax.errors import FitWarning as FitWarning
+    from gfnn_jax.errors import InputError as InputError
+    from gfnn_jax.errors import WorkError as WorkError
+    from gfnn_jax.evaluate import figures as figures
+    from gfnn_jax.evaluate import metrics as metrics
+    from gfnn_jax.evaluate.discover import discover as discover
+    from gfnn_jax.exports.export import export as export
+    from gfnn_jax.families import from_function as from_function
+    from gfnn_jax.families.functions import register_function as register_function
+    from gfnn_jax.generating.charts import CHARTS as CHARTS
+    from gfnn_jax.generating.charts import Chart as Chart
+    from gfnn_jax.learn.fit import fit as fit
+    from gfnn_jax.learn.fitted import Fit as Fit
+    from gfnn_jax.learn.monitors import Monitors as Monitors
+    from gfnn_jax.learn.monitors import fit_monitors as fit_monitors
+    from gfnn_jax.learn.options import FitOptions as FitOptions
+    from gfnn_jax.learn.options import GeneratingFunction as GeneratingFunction
+    from gfnn_jax.learn.options import Hamiltonian as Hamiltonian
+    from gfnn_jax.learn.options import Lagrangian as Lagrangian
+    from gfnn_jax.learn.options import between as between
+    from gfnn_jax.learn.saved import load as load
+    from gfnn_jax.maps.saved import register as register
+    from gfnn_jax.maps.stroboscopic import stroboscopic as stroboscopic
+    from gfnn_jax.maps.symplectic_map import SymplecticMap as SymplecticMap
+    from gfnn_jax.models.arms.arm import Arm as Arm
+    from gfnn_jax.models.model import Fitted as Fitted
+    from gfnn_jax.models.model import TrainingData as TrainingData
+    from gfnn_jax.phase_space import Pairs as Pairs
+    from gfnn_jax.scenes import Scene as Scene
+    from gfnn_jax.scenes.draws import sample_pairs as sample_pairs
+    from gfnn_jax.scenes.draws import sample_states as sample_states
+    from gfnn_jax.scenes.draws import sample_test_states as sample_test_states
+    from gfnn_jax.scenes.trajectories import reference_trajectories as reference_trajectories
 
     __version__: str
 
@@ -79,48 +88,7 @@ _NAMES = {  # of what each module gives
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 
-__all__ = [
-    "CHARTS",
-    "Arm",
-    "Bracket",
-    "Chart",
-    "Fit",
-    "FitError",
-    "FitOptions",
-    "FitWarning",
-    "Fitted",
-    "GeneratingFunction",
-    "Hamiltonian",
-    "InputError",
-    "Lagrangian",
-    "Monitors",
-    "Pairs",
-    "Recording",
-    "Scene",
-    "SymplecticMap",
-    "TrainingData",
-    "WorkError",
-    "between",
-    "discover",
-    "enable_compile_cache",
-    "export",
-    "figures",
-    "fit",
-    "fit_monitors",
-    "from_function",
-    "load",
-    "metrics",
-    "read",
-    "records",
-    "reference_trajectories",
-    "register",
-    "register_function",
-    "sample_pairs",
-    "sample_states",
-    "sample_test_states",
-    "scenes",
-    "stroboscopic",
-]
+__all__ = [*_MODULES, *_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -236,11 +236,8 @@ class Recording:
             run: {name: column * factors[name] for name, column in of_run.items()}
             for run, (_, of_run) in runs.items()
         }
-        for what, wanted in (
-            ("std", std),
-            ("offset", names_of["offset"]),
-            ("scale", names_of["scale"]),
-        ):
+        about = {"std": std} | {name: names_of[name] for name in ("offset", "scale")}
+        for what, wanted in about.items():
             check_known(source, what, wanted, with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)

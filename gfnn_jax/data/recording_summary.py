@@ -194,21 +194,13 @@ def summarise(
     files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
     windows = [known.noise[name].size for name in recording.positions]
     coarsest = known.step * max(min(windows) // _Shown.window, 1) if windows else None
-    return RecordingSummary(
-        recording.source,
-        counts,
-        (float(between.min()), known.step, float(between.max())),
-        tuple((recording.runs[r], a, b) for r, a, b in holes),
-        tuple(_column(known, name, doubted) for name in known.columns),
-        period,
-        coarsest,
-        loss,
-        bool(recording.inputs),
-        found,
-        typed,
-        f"gfnn fit {files}{as_typed(typed)} --out model",
-        recording.clock,
-    )
+    lengths = float(between.min()), known.step, float(between.max())
+    pauses = tuple((recording.runs[r], a, b) for r, a, b in holes)
+    columns = tuple(_column(known, name, doubted) for name in known.columns)
+    motion = period, coarsest, loss, bool(recording.inputs)
+    advice = found, typed, f"gfnn fit {files}{as_typed(typed)} --out model"
+    read = recording.source, counts, lengths, pauses, columns
+    return RecordingSummary(*read, *motion, *advice, recording.clock)
 
 
 def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:

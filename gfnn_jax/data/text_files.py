@@ -247,19 +247,11 @@ class TextFile:
 
         names = [*self.names, _BEYOND]
         words = {n for n in names if n not in wanted or n in self.text or n in as_text}
-        options: dict[str, Any] = {
-            "sep": self._separator,
-            "decimal": self._decimal,
-            "comment": self._comment,
-            "header": None,
-            "names": names,
-            "dtype": {n: str if n in words else np.float64 for n in names},
-            "skiprows": self._first,
-            "chunksize": rows,
-            "na_values": list(_MISSING),
-            "skipinitialspace": True,
-            "index_col": False,
-        }
+        kinds = {n: str if n in words else np.float64 for n in names}
+        options: dict[str, Any] = {"sep": self._separator, "decimal": self._decimal}
+        options |= {"comment": self._comment, "header": None, "names": names, "dtype": kinds}
+        options |= {"skiprows": self._first, "chunksize": rows, "na_values": list(_MISSING)}
+        options |= {"skipinitialspace": True, "index_col": False}
         last, begin = self.names[-1], None
         try:
             with self._open() as stream, pd.read_csv(stream, **options) as blocks:

@@ -63,10 +63,6 @@ def beside_flow(map_: SymplecticMap, pairs: Pairs, degree: int = 6) -> BesideFlo
     def relative(x: np.ndarray) -> float:
         return float(np.sqrt(np.mean(x**2)))
 
-    return BesideFlow(
-        float(found[0]),
-        relative(of_state[..., 1:] @ found[1:] / unit),
-        relative((momenta - of_state @ found) / unit),
-        relative(moved / spread),
-        relative(turned / unit),
-    )
+    gauge, left = of_state[..., 1:] @ found[1:], momenta - of_state @ found
+    parts = relative(gauge / unit), relative(left / unit)
+    return BesideFlow(float(found[0]), *parts, relative(moved / spread), relative(turned / unit))

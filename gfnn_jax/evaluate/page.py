@@ -287,24 +287,15 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     if law is not None and law.formula:
         with_formula = "Lagrangian" not in law.formula
         shown = as_mathml(law.formula) if with_formula else f"<mtext>{escape(law.formula)}</mtext>"
-        yield Section(
-            "Law",
-            formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
-            lines=[*fit.bracket_lines, *law.notes],
-            heads=("term", "coefficient"),
-            rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
-        )
-    yield Section(
-        "The map",
-        lines=[
-            f"{found.line}.",
-            f"Time step {float(np.asarray(fit.map.dt)):g}.",
-            f"The search ended: {found.ended}.",
-            *([found.stated_by] if found.stated_by else []),
-            *([str(found.positions)] if found.positions is not None else []),
-            *map(str, found.partial_laws if not found.met else ()),
-        ],
-    )
+        formulas = [("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")]
+        rows = [(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms]
+        heads, lines = ("term", "coefficient"), [*fit.bracket_lines, *law.notes]
+        yield Section("Law", formulas=formulas, lines=lines, heads=heads, rows=rows)
+    lines = [f"{found.line}.", f"Time step {float(np.asarray(fit.map.dt)):g}."]
+    lines += [f"The search ended: {found.ended}.", *filter(None, [found.stated_by])]
+    lines += [str(found.positions)] if found.positions is not None else []
+    lines += map(str, found.partial_laws if not found.met else ())
+    yield Section("The map", lines=lines)
     heads, rows = candidate_cells(found)
     yield Section("Candidates", heads=heads, rows=rows)
     null = law.null_terms if law is not None else ()

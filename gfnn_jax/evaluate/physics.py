@@ -142,12 +142,9 @@ class _System(NamedTuple):
         """The system with its coefficients moved by these (k,)."""
         ends = np.cumsum([self.law.terms.count, self.law.friction.count, self.law.gains.size])
         of_terms, of_losses, _, of_rate = np.split(by, ends)
-        law = dataclasses.replace(
-            self.law,
-            coefficients=self.law.coefficients + of_terms,
-            losses=np.asarray(self.law.losses) + of_losses,
-            uniform=self.law.uniform + (of_rate[0] if len(of_rate) else 0.0),
-        )
+        terms, losses = self.law.coefficients + of_terms, np.asarray(self.law.losses) + of_losses
+        rate = self.law.uniform + (of_rate[0] if len(of_rate) else 0.0)
+        law = dataclasses.replace(self.law, coefficients=terms, losses=losses, uniform=rate)
         return self._replace(law=law)
 
     def with_errors(

@@ -22,6 +22,7 @@ _ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside
 _OF_LAW = ("terms", "friction", "constants", "symmetries", "rivals", "notes", "dropped")
 _OF_FRICTION = ("kinds", "odds", "limits")
 _OF_PAIRS = ("validation_rms", "validation_relative", "tolerance", "tolerance_met")
+_OF_MAP = ("symplecticity_defect", "chart_determinant_min", "newton_iterations_max")
 _COSTS = ("operations", "microseconds_per_step", "fit_seconds", "rank", "condition", "chosen")
 
 
@@ -44,15 +45,9 @@ def _of(result: Any, *names: str) -> dict[str, Any]:
 
 
 def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
-    return {
-        "verdict": fit.verdict,
-        "scene": scene,
-        "dt": float(np.asarray(fit.map.dt)),
-        "seed": seed,
-        "dtype": str(fit.map.scale.dtype),
-        "device": device(),
-        "versions": versions(),
-    }
+    dt, dtype = float(np.asarray(fit.map.dt)), str(fit.map.scale.dtype)
+    made = {"verdict": fit.verdict, "scene": scene, "dt": dt, "seed": seed, "dtype": dtype}
+    return {**made, "device": device(), "versions": versions()}
 
 
 def assemble(
@@ -189,12 +184,7 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
         "friction_level": sensors.level,
         "wander": sensors.wander,
         **_of(fit, "units", "velocities", "whiteness", "gauge", "energy", "horizon"),
-        "map": {
-            "multiplier": map_.multiplier(),
-            "symplecticity_defect": None,
-            "chart_determinant_min": None,
-            "newton_iterations_max": None,
-        },
+        "map": {"multiplier": map_.multiplier(), **dict.fromkeys(_OF_MAP)},
         "rollout": None,
         "candidates": [],
     }

@@ -222,8 +222,6 @@ class SharedData:
 CAP, QUICK_CAP = 60.0, 2.0  # seconds, at the rate below
 RATE = 4e10  # counted operations of a training that a quiet core makes in a second, about
 
-__all__ = ["CAP", "OURS", "PAPER_GFNN", "RATE", "TITLES", "compare"]
-
 
 def compare(
     name: str,
@@ -290,24 +288,11 @@ def compare(
                     for name, of in metrics.ELEMENTS.items()
                 },
             }
-        result = {
-            "scene": name,
-            "dt": scene.dt,
-            "seed": seed,
-            "dtype": "float64",
-            "device": report.device(),
-            "versions": versions(),
-            "quick": quick,
-            "cap": cap,
-            "data": {
-                "source": "reference data of the scene",
-                "num_pairs": data.num_pairs,
-                "digest": pairs_digest(data.fresh),
-            },
-            "kl_bins": BINS,
-            "job": job,
-            "methods": reported,
-        }
+        result: dict[str, Any] = {"scene": name, "dt": scene.dt, "seed": seed, "dtype": "float64"}
+        result |= {"device": report.device(), "versions": versions(), "quick": quick, "cap": cap}
+        drawn = {"num_pairs": data.num_pairs, "digest": pairs_digest(data.fresh)}
+        result["data"] = {"source": "reference data of the scene", **drawn}
+        result |= {"kl_bins": BINS, "job": job, "methods": reported}
         with outputs.atomic_folder(output.out) as folder:
             for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")

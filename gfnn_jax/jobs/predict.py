@@ -138,13 +138,10 @@ def predict(
             stepped = map_.sharded(asked.devices or "all")
         if isinstance(drawn, Samples):
             drawn = Sharded(drawn, stepped.devices)
-    identity = {
-        "model": saved.digest(model),
-        "initial": digest_of(*begin),
-        "outside": asked.outside or "continue",
-        **({} if drawn is None else {"samples": asked.samples, "horizon_size": asked.horizon}),
-        **({"block": stepped.block} if isinstance(stepped, Sharded) else {}),
-    }
+    identity: dict[str, Any] = {"model": saved.digest(model), "initial": digest_of(*begin)}
+    identity["outside"] = asked.outside or "continue"
+    identity |= {} if drawn is None else {"samples": asked.samples, "horizon_size": asked.horizon}
+    identity |= {"block": stepped.block} if isinstance(stepped, Sharded) else {}
     job = _Prediction(map_, stepped, drawn, band, asked, output)
     if share is None or not isinstance(stepped, Sharded):
         return job.written(output.out, begin, identity)

@@ -222,12 +222,9 @@ def _stated(chosen: Chosen, found: Searched, by: str, rows, images) -> Chosen:
     """The error of these rows' images (n, 2d) in the user's coordinates."""
     error = measured_error(found.data, found.tolerance, images, rows)
     error = error._replace(bound=float(np.hypot(error.bound, _of_steps(chosen, found))))
-    return chosen._replace(
-        candidate=with_error(chosen.candidate, error),
-        by=by,
-        stated_by=_stated_by(by, found, rows),
-        few=of_few(error_of_each(found.data, found.tolerance, images, rows), found.tolerance),
-    )
+    few = of_few(error_of_each(found.data, found.tolerance, images, rows), found.tolerance)
+    candidate, words = with_error(chosen.candidate, error), _stated_by(by, found, rows)
+    return chosen._replace(candidate=candidate, by=by, stated_by=words, few=few)
 
 
 def _stated_by(by: str, found: Searched, rows: np.ndarray) -> str:

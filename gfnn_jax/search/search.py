@@ -343,15 +343,9 @@ def _calibrated(entry: Entry, ratio: float | None) -> Entry:
     candidate = entry.candidate
     if candidate.validated or ratio is None:
         return entry
-    return entry._replace(
-        candidate=dataclasses.replace(
-            candidate,
-            validation_rms=ratio * candidate.validation_rms,
-            validation_relative=ratio * candidate.validation_relative,
-            validation_bound=ratio * candidate.validation_bound,
-            deviations=ratio * candidate.deviations,
-        )
-    )
+    errors = ("validation_rms", "validation_relative", "validation_bound", "deviations")
+    scaled = {name: ratio * getattr(candidate, name) for name in errors}
+    return entry._replace(candidate=dataclasses.replace(candidate, **scaled))
 
 
 def _finalists(entries: list[Entry]) -> list[Entry]:
