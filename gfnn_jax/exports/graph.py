@@ -39,8 +39,8 @@ class LawGraph:
     tape: its operations, on inputs ``z``, ``u``, ``p`` and ``sigma``. rates: (2d,) of them ż.
     speeds: (F,) the speeds of the friction that σ belongs to; limits: (F,) the forces at which
     these hold, 0 of friction that has a kink alone; directions: (F, d) of the speeds. names,
-    arguments, terms: of z, u and p; values: of p. polynomials: (n, k) for each of u, which of u are
-    its coefficients of 1, τ, …, τ the time since a step began; advances: which of u is the time.
+    arguments, terms: of z, u and p; values: of p. series: for each of u the places of its
+    coefficients of 1, τ, …, τ the time since a step began; time: which of u is the time, or None.
     dt, scale: of a step, and of z.
     """
 
