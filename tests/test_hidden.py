@@ -159,6 +159,26 @@ def test_the_work_of_a_search_is_counted_and_ends_with_what_was_found(monkeypatc
         searched(1.0)
 
 
+def test_any_two_modes_may_rub_on_each_other(monkeypatch):
+    """The friction of three carts is any matrix in their modes: of five of its six numbers a law
+    left 1.4 times the noise, and was none."""
+    t = STEP * np.arange(1_200)
+    x = np.cos(1.3 * t) + np.cos(2.9 * t) + np.cos(4.1 * t)
+    recording = with_hidden(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[]), 2)
+    problem = samples_of(recording).problem
+    tried = []
+
+    def again(fit, structure, *others, **known):
+        tried.append(structure)
+        return fit
+
+    monkeypatch.setattr(hidden.LawFit, "again", again)
+    (found, *_) = oscillations(t, x, 3)
+    list(hidden._of_modes(hidden._from(problem, found)))
+    matrices = [np.outer(c, c).ravel() for c, *_ in tried[0].friction]
+    assert np.linalg.matrix_rank(matrices) == 6
+
+
 @pytest.mark.slow
 def test_what_has_no_second_oscillation_has_no_hidden_coordinate():
     t = STEP * np.arange(400)

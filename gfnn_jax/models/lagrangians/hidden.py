@@ -16,7 +16,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -288,7 +288,9 @@ def _of_modes(problem: ArcProblem) -> list[LawFit]:
     none, omega = (0,) * d, sensor.omega
     masses = [(libraries.unit(d, i, i), none, none, 0.0) for i in range(d)]
     springs = [(none, libraries.unit(d, i, i), none, 0.0) for i in range(d)]
-    friction = tuple(libraries.losses(d, (LINEAR,), 0.0))
+    # by relative speeds of any two: modes have no neighbours
+    pairs = [tuple((b - a).tolist()) for a, b in combinations(np.eye(d, dtype=int), 2)]
+    friction = tuple(libraries.losses(d, (LINEAR,), 0.0, joints=pairs))
     linear = Structure(d, (*masses, *springs), friction[:d], (), 0, problem.sensors)
     known: dict[Key, float] = {
         ("term", row): -0.5 * w**2 for row, w in zip(springs, omega, strict=True)
