@@ -170,6 +170,17 @@ class _Canyon:
         return Observed(some, np.eye(3)[:, :1] * np.ones((*x.shape[:2], 1, 1)), slopes)
 
 
+def test_no_jump_is_left_that_readings_pull_open():
+    """A state that does not move, read as if it jumped by 2 σ halfway: in 2,000 readings, for the
+    jump costs less than that the residuals of an orbit do."""
+    y, sigma = np.zeros((1, 2_000, 3)), 0.01
+    y[:, 1_000:, 0], y[..., 2] = 2 * sigma, 1.0
+    fit = Readings(_Canyon(), y, np.full(3, sigma)).fit(np.ones(2), y[..., :1], np.array([sigma]))
+    assert fit.converged
+    np.testing.assert_allclose(fit.x, sigma, rtol=1e-2)
+    assert fit.cost > 500
+
+
 class _Bent(_Canyon):
     """The same with its defects alone."""
 

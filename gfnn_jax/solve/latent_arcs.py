@@ -150,8 +150,10 @@ class Options:
 
     # a defect of this many standard deviations costs as much as a residual of one
     defect: float = 0.1
-    # standard deviations, rms: arcs whose defects are smaller are orbits of the model
+    # Standard deviations, rms: of all defects, below which steps lower the cost; and of the jumps
+    # of an arc, added up as those of a random walk, below which it is an orbit of the model.
     closed: float = 0.1
+    joining: int = 5  # steps that close what a descent has left open
     settled: float = 0.003  # of the noise: a change that needs no further iteration
     # Of the largest pivot, each in units of its column, below which one determines nothing: of an
     # arc of gross errors alone, or of the speed of a body that sticks.
@@ -265,9 +267,17 @@ class Readings:
         if not np.isfinite(here.cost):
             return start.fitted(0, converged=False)
         found = descended(start, _DAMPING, max_iterations)
+        steps = found.steps
+        if not found.problem.here.joined:
+            joining = dataclasses.replace(found.problem, joins=True)
+            found = descended(joining, _DAMPING, OPTIONS.joining)
+            steps += found.steps
+            if found.problem.here.joined and not found.settled:
+                found = descended(found.problem, _DAMPING, max(max_iterations - steps, 0))
+                steps += found.steps
         last: _AtStates = found.problem
-        converged = found.settled or (found.stuck and last.closed(last.here))
-        return last.fitted(found.steps, converged and bool(np.isfinite(last.here.cost)))
+        converged = (found.settled or found.stuck) and last.here.joined
+        return last.fitted(steps, converged and bool(np.isfinite(last.here.cost)))
 
     def linearised(self, p: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss
@@ -368,9 +378,11 @@ class _AtStates:
     """The problem of all arcs where a descent stands, the best iterate that it came by, and which
     arcs are ``moving`` (indices): of those that share nothing, the ones that have not settled.
 
-    While defects matter a step has to close them; then it has to lower the cost. Once a step has
-    brought much less than the linear problem promised, steps are bent along the valley
-    (``bends``), where the model is a `Stepping` one.
+    While defects matter a step has to close them; then it has to lower the cost. They matter until
+    they are small all in all (`closed`); where a descent has ended so, with a jump that readings
+    pull open, until each arc is an orbit (``joins``). Once a step has brought much less than the
+    linear problem promised, steps are bent along the valley (``bends``), where the model is a
+    `Stepping` one.
     """
 
     data: _Data
@@ -378,6 +390,7 @@ class _AtStates:
     best: _Iterate
     moving: np.ndarray
     bends: bool = False
+    joins: bool = False
 
     @property
     def _apart(self) -> bool:
@@ -389,8 +402,8 @@ class _AtStates:
         return _reduced(self.here, leverage=self.data.least is not None)
 
     def closed(self, at: _Iterate) -> bool:
-        """True where arcs are orbits of the model."""
-        return at.gap <= OPTIONS.closed * math.sqrt(self.here.x.size)
+        """True where defects are small enough for a step to lower the cost."""
+        return at.joined if self.joins else at.gap <= OPTIONS.closed * math.sqrt(at.x.size)
 
     def tried(self, damping: float, failures: int) -> Tried:
         """A step of p and x, which bends at first; each that failed halves the next. Where
@@ -500,7 +513,7 @@ class _AtStates:
         if self._apart:
             gained, most = before.merits - there.merits, OPTIONS.closed**2 * there.x[0].size
             cost = before.merits - before.gaps / OPTIONS.defect**2
-            ended = np.maximum(before.gaps, there.gaps) <= most
+            ended = (before.gaps <= most) & (there.open == 0)
             ended &= gained <= self.data.tolerance * cost
             moving = self.moving[~(ended | (gained <= 0))[self.moving]]
             return _AtStates(self.data, there, there, moving), bool(ended.all())
@@ -531,7 +544,7 @@ class _AtStates:
 
     def fitted(self, iterations: int, converged: bool) -> Fitted:
         """The fit that ends here."""
-        best, measured = self.best if self.closed(self.best) else self.here, self.data.measured
+        best, measured = self.best if self.best.joined else self.here, self.data.measured
         rows, m = self._rows if best is self.here else _reduced(best), best.x.shape[-1]
         finite = np.isfinite(rows.factor).all()
         return Fitted(
@@ -546,7 +559,7 @@ class _AtStates:
             rows.transports,
             rows.rows,
             best.open if finite else best.open + np.inf,
-            best.cost if self.closed(best) and finite else np.inf,
+            best.cost if best.joined and finite else np.inf,
             iterations,
             converged and bool(finite),
         )
@@ -639,9 +652,14 @@ class _Iterate:
             return cost + self.gaps / OPTIONS.defect**2
 
     @property
+    def joined(self) -> bool:
+        """True where each arc is an orbit of the model."""
+        return bool(np.isfinite(self.gap)) and not self.open.any()
+
+    @property
     def open(self) -> np.ndarray:
         """Cost of the defects of each arc (A,) that is no orbit, and 0."""
-        most = OPTIONS.closed**2 * self.x[0].size
+        most = OPTIONS.closed**2 * self.x.shape[-1]
         return np.where(self.gaps <= most, 0.0, self.gaps / OPTIONS.defect**2)
 
     @cached_property
