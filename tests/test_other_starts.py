@@ -14,10 +14,11 @@ import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.friction import LINEAR, QUADRATIC
 from gfnn_jax.maps.estimates import _with_zeros
+from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.friction_choice import table_of
 from gfnn_jax.models.lagrangians.libraries import losses, potentials
 from gfnn_jax.models.lagrangians.recordings import samples_of
-from gfnn_jax.models.lagrangians.search import with_equal_masses
+from gfnn_jax.models.lagrangians.search import TermSearch, with_equal_masses
 from gfnn_jax.models.lagrangians.starts import best_start
 from gfnn_jax.models.lagrangians.structure import SINE, Structure
 from gfnn_jax.models.lagrangians.weak_form import weak_start
@@ -58,6 +59,29 @@ def test_the_unit_of_columns_does_not_matter(unit):
         table = table_of(fit, friction)
         found[-1].append(table.judged([1]).cost / table.judged([]).cost)
     assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("converges", [True, False])
+def test_a_term_stays_without_which_the_fit_does_not_converge(converges, monkeypatch):
+    """A law whose last fit has not converged is none; one with a weak term is."""
+    t, noise = np.linspace(0, 20, 400), 1e-3 * np.random.default_rng(0).normal(size=400)
+    x = motion(lambda q, v: -q - 0.02 * v, [1.0, 0.0], t)[0] + noise
+    problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
+    terms = (((2,), (0,), (0,), 0.0), *potentials(1, [0], 2, 3))
+    structure = Structure(1, terms, tuple(losses(1, (LINEAR,), 0.0)))
+    known = {("term", terms[1]): -0.5}
+    fit = problem.fit(structure, known, problem.arcs(4.0), problem.scales.sigma)
+    again = LawFit.again
+
+    def fewer(of, *args, **kw):
+        less = again(of, *args, **kw)
+        return dataclasses.replace(
+            less, fitted=dataclasses.replace(less.fitted, converged=converges)
+        )
+
+    monkeypatch.setattr(LawFit, "again", fewer)
+    pruned = TermSearch(None, None).prune(fit)
+    assert len(pruned.structure.terms) == (2 if converges else 3)
 
 
 @pytest.mark.slow

@@ -379,6 +379,8 @@ class TermSearch:
             less = fit.again(smaller)
             if not _leaves_little_more(less, fit):
                 return None  # the others take no orbit to where they would make up for it
+            if fit.fitted.converged and not less.fitted.converged:
+                return None  # without it others are not determined
             _dropped(fit, key, f"{z:.1f} standard errors")
             return less
 
