@@ -1,7 +1,5 @@
 """Long rollouts of laws on numbers, with a bracket or canonical: by `flows.compiled_steps`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

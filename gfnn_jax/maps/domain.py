@@ -7,8 +7,6 @@ Comput. Math. 45 (2019), 1439). It is a sum of squares of a few dozen terms, che
 step. Scaling the coordinates does not change it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

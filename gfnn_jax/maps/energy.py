@@ -3,8 +3,6 @@
 stored = supplied − lost,      d/dt H = Σ_k u_k (Gᵀv)_k − v·∂R/∂v − γ p·v
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 

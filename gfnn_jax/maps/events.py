@@ -6,8 +6,6 @@ numbers a body slides, or sticks for as long as it is held. Backwards there is n
 body at rest does not tell when it stopped.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

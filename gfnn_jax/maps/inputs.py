@@ -6,8 +6,6 @@ rule between samples, its coefficients are linear in the samples, so that a roll
 differentiated in its inputs.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Rollouts of a map, lane by lane: the state of each, what ends it, and the compiled programs."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp

@@ -4,8 +4,6 @@ States are z = (q, p) with p = ∂L/∂v; `maps.laws.states_of` and `velocities_
 velocities and back. Where only uniform friction acts, or none, the map is conformally symplectic.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from itertools import product

@@ -17,8 +17,6 @@ so that da/dt = −H̃(z(t)): H̃ is the derivative of a known function, by cent
 along the orbit, and a binomial mean over the iterates takes cos²(½ωh) of it per order.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from math import comb, factorial
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ counted from the step's number: t₀ + n dt, reduced by whole periods without ro
 rollout of any length keeps the drive's phase.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

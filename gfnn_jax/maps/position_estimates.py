@@ -6,8 +6,6 @@ that of the coefficients of S, by which the estimate and the rollout err togethe
 a reading; all to first order.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any, NamedTuple
 

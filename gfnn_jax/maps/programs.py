@@ -4,8 +4,6 @@ Each takes states z (B, 2d) or one state (2d,), in the user's coordinates, and t
 Inside, coordinates⁻¹ ∘ pieces ∘ coordinates, angles are reduced and their turns counted.
 """
 
-from __future__ import annotations
-
 from functools import partial, wraps
 
 import jax

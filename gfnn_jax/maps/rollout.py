@@ -4,8 +4,6 @@ This module knows nothing of generating functions. Any ``step(carry) -> carry`` 
 every method that ends in a step function is rolled out, timed and judged by the same code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

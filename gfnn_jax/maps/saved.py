@@ -6,8 +6,6 @@ and no code runs from a loaded file. The two kinds of function that a map may ho
 of coordinates and its features, are taken from a scene, by its name.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import importlib

@@ -6,8 +6,6 @@ device, and nothing is sent from one to another. (``jax.shard_map`` compiles dif
 devices than for one, and the last digits would differ.)
 """
 
-from __future__ import annotations
-
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any

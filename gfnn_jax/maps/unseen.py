@@ -1,8 +1,6 @@
 """Starts of a coordinate that no sensor shows as it is: from its velocity, from times of events, or
 from a channel that oscillates with it, as an accelerometer does."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from itertools import product

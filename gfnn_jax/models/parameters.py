@@ -8,8 +8,6 @@ of it is entire in that, where a pole near the data would slow the series in the
 The time of a drive enters by the harmonics of its period.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product

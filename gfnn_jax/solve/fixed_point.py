@@ -7,8 +7,6 @@ residual is smaller. Each iterate is judged by the residual at it, as in `solve.
 data. A lane that has converged is frozen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable

@@ -8,8 +8,6 @@ has shrunk, else from A d_{k−1}. There is no Hessenberg matrix, and the method
 Memory: 2 `SPACE` vectors for each lane.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Small dense linear systems, one for each lane of a batch."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfnn_jax.arrays import namespace

@@ -12,8 +12,6 @@ Derivatives of ``root`` come from the implicit function theorem, in forward and 
 of ``iterate`` are those of the iterations that ran, which an honest symplecticity defect needs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable

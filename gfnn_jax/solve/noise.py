@@ -14,8 +14,6 @@ law fitted to white residuals is that of generalised least squares, and what it 
 (Rasmussen & Williams, Gaussian Processes for Machine Learning (2006) §2.7).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any, Protocol, runtime_checkable
 

@@ -1,7 +1,5 @@
 """Status of a solve or of a lane of a rollout. Status is data: a failed lane raises nothing."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 OK, LEFT_DOMAIN, STOPPED_AT_EDGE, NOT_CONVERGED, NON_FINITE = range(5)

@@ -4,8 +4,6 @@ Positions are smoothed by splines whose stiffness their own noise tells (`signal
 give velocities and accelerations; no filter is chosen. Forces are taken as they were measured.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations

@@ -2,8 +2,6 @@
 the map of it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -8,8 +8,6 @@ Killing form and ideals of dimension three; se(3) has three rotations that turn 
 aff(1)^k, {a_i, b_i} = a_i, has what commutes and what the rest multiplies. NumPy.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

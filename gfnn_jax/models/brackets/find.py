@@ -6,8 +6,6 @@ brackets shares the motion, the one whose Casimir is nearest to a sphere in unit
 coordinates. NumPy.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Iterator

@@ -8,8 +8,6 @@ each from the last S: a chart's x is then known well enough. S is determined up 
 the Casimirs, and on a thin shell up to more: small singular values are left out.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

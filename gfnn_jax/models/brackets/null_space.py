@@ -7,8 +7,6 @@ coordinate in units of its size: constant B, then B affine in z, then log-canoni
 b_ij z_i z_j. NumPy.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from itertools import combinations

@@ -5,8 +5,6 @@ f_m(parameters), or Σ_sites Σ_j c_j φ_j(w), is linear in its coefficients; it
 of an H, its data those of any S: target gradients at evaluation points.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Iterator

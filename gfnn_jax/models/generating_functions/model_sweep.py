@@ -1,7 +1,5 @@
 """The sizes of a model that follows the protocol `models.model.Model`, as a sweep of the search."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable

@@ -10,8 +10,6 @@ would move the fit. What no member represents does not show in their spread: hel
 how much wider the posterior is.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

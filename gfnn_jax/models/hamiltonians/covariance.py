@@ -5,8 +5,6 @@ noise is none. The part of the mean square that no K explains is noise, if K exp
 noise would let it (an F test); what K explains is misfit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -13,8 +13,6 @@ description length is taken,
 numbers (Rissanen 1978).
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from functools import partial

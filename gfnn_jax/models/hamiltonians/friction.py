@@ -16,8 +16,6 @@ A map cannot leave such steps out: its dry friction is √(v² + ε²) − ε wi
 can follow, or as the tolerance asks (`followed`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -2,8 +2,6 @@
 with the cheapest steps, errors, covariance, messages.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Iterator

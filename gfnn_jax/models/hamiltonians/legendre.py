@@ -7,8 +7,6 @@ Both are linear in the coefficients of L, with v the difference of positions ove
 of a pair: to O(dt²) that is where the fit through the flow starts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Libraries of terms for H: polynomials, features, modes of angles, a user's own terms."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import Any
 

@@ -5,8 +5,6 @@ structure, with friction or without, or with parameters; each is fitted from the
 several starts.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType

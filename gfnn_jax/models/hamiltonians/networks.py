@@ -7,8 +7,6 @@ misses, a deferred correction: its fixed point is the H whose flow maps z₀ to 
 the flow in the weights is needed, and every round trains by the same compiled program.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

@@ -8,8 +8,6 @@ tolerance; where there are angles, one library grows mode by mode. Terms that ar
 go while the held-out error does not rise. Which is preferred, H or a map, `preferred` says.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from functools import partial

@@ -6,8 +6,6 @@ state: the Poisson bracket {φ_j, I} of each term with the generator I of a cont
 restricted where these allow it; a law then has the symmetry to roundoff, and conserves I.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

@@ -20,8 +20,6 @@ standard errors, and each power as 1, so that of functions that do as well the p
 sets grow, shrink and change a function at a time.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from itertools import product

@@ -9,8 +9,6 @@ projection). Motion of several frequencies has lines too beside a library that l
 tells is whether the law with the drive leaves noise.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any

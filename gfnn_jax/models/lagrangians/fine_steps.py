@@ -6,8 +6,6 @@ steps do. Of a step of order 5 the error falls with the fifth power of its lengt
 friction acts or inputs jump it falls more slowly, so that it is measured again.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -15,8 +15,6 @@ positions and, in V, of the inputs: the current of a magnet, V: i**2/(0.01 + y),
 moves, V: (y - s)**2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Law in the words of its recording: names of columns, units of the file, warnings."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence

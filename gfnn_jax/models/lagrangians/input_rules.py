@@ -15,8 +15,6 @@ those in between do half a sample later, but for little: of rules whose costs di
 chance the one without a delay is taken.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType

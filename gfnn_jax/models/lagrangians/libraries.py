@@ -7,8 +7,6 @@ of freedom has T = ½v². `more` are the next orders, of which a fit takes only 
 asks for.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, permutations

@@ -21,8 +21,6 @@ one is ruled out:
 Shares are of squares that a polynomial explains in quarters of the record it was not fitted to.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -7,8 +7,6 @@ of all motions that are compared err least. All have as many readings, at some i
 or faint force a longer motion tells more.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from itertools import product

@@ -4,8 +4,6 @@ samples → nodes → search (`models.lagrangians.search`) → velocities → ba
 in the recording's words (`models.lagrangians.in_words`)
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import re

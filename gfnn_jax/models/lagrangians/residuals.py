@@ -6,8 +6,6 @@ later, has a standard deviation of 1/√N. What exceeds that was not noise: a fo
 (correlation with itself), or the timing or gain of an input (correlation with it).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple

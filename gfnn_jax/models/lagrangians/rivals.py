@@ -7,8 +7,6 @@ correct it. Laws with as many coefficients have odds by the sums of their square
 (`fitting.evidence`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import shlex

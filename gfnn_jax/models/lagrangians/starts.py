@@ -6,8 +6,6 @@ was switched on anywhere; coordinates that nothing couples, for the weak form ma
 such a one as small as it likes; bodies in a potential of lengths.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Sequence

@@ -17,8 +17,6 @@ with σ at its best and r what C⁻¹ leaves (Harville, J. Am. Stat. Assoc. 72 (
 is wrong colours residuals too: what is found here is a candidate, and held-out forecasts judge it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """Generated maps that a law helps to: of pairs of its flow, or of what its flow leaves over."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

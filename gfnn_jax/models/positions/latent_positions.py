@@ -6,8 +6,6 @@ noise σ, with orbits of S, whose positions are latent (`solve.latent_arcs`); σ
 residuals. Least squares only starts it. `map_of` makes the map of an S.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable
 from functools import partial

@@ -1,7 +1,5 @@
 """The dictionary of the atoms that are tried, and the states at which they are looked at."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, combinations, combinations_with_replacement, permutations, product

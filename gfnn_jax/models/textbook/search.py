@@ -8,8 +8,6 @@ factor of about (ωh)² a time; others stall. That is how the right one is told 
 the corrected gradients of the law that came closest are what the next round of matching is given.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ once. All are written for complex θ too: ∂/∂θ is the imaginary part of a s
 roundoff (Squire & Trapp 1998).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 Kind = tuple[str, float]  # name and exponent n
