@@ -29,7 +29,7 @@ from twins import TWINS, multisine
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
-from gfnn_jax.models.lagrangians.next_motion import OPTIONS
+from gfnn_jax.models.lagrangians.next_motion import Options
 
 SEED, DRAWS = 27_182, 4
 COUNTS = (16, 32, 64, 128, 256)  # samples of the second motion
@@ -191,7 +191,7 @@ def measured(name: str, quick: bool) -> Numbers:
             continue
         q = base.states[:, : len(plant.names)]
         far = float(np.max(np.abs(q - np.median(q))))
-        reach = min(max(OPTIONS.further) * far, OPTIONS.highest)
+        reach = min(max(Options.further) * far, Options.highest)
         held_out = []
         for _ in range(HELD_OUT):
             states, u, _ = at_random(plant, rng, 3 * ahead, reach, plant.dt)

@@ -1,6 +1,5 @@
 """Candidates: the error of one step, and which sizes exist."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -67,7 +66,7 @@ def test_a_size_too_large_to_count_is_never_looked_at():
         looked_at.append(degree)
         return Products(inputs, degree)
 
-    groups = (map(family, group) for group in sweeps.OPTIONS.degrees)
+    groups = (map(family, group) for group in sweeps.Options.degrees)
     kept = list(itertools.chain(*sweeps._determined(groups, 10**6, sweeps.ROWS_PER_TERM)))
     assert [f.degree for f in kept] == [2, 3, 4]
     assert looked_at == [2, 3, 4, 5]
@@ -118,8 +117,7 @@ def test_the_estimate_is_of_the_size_of_the_error():
 
 def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     """Where a factorisation of all rows would take too long, it is of a sample of them."""
-    options = dataclasses.replace(sweeps.OPTIONS, most_operations=300 * 27**2)
-    monkeypatch.setattr(sweeps, "OPTIONS", options)
+    monkeypatch.setattr(sweeps.Options, "most_operations", 300 * 27**2)
     found = Search([of_kicks()], 1e-11, Budget(), quiet, quiet).to_its_end()
     assert found.ranking[0].candidate.label == "polynomial 4"
     assert found.ranking[0].candidate.validation_bound < 1e-11
@@ -132,8 +130,7 @@ def test_a_factorisation_stops_when_the_time_is_spent():
 
 
 def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_path):
-    options = dataclasses.replace(sweeps.OPTIONS, worth_keeping=0.0)
-    monkeypatch.setattr(sweeps, "OPTIONS", options)
+    monkeypatch.setattr(sweeps.Options, "worth_keeping", 0.0)
 
     def again():
         swept = [of_kicks(factors=KeptFactors(tmp_path))]

@@ -1,7 +1,5 @@
 """Uneven, incomplete and short recordings, and sensors that show no position."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from analytic import states_in_motion
@@ -105,8 +103,7 @@ def test_windows_of_parts_of_the_nodes_add_up(monkeypatch):
     tables = [{"t": t, "x1": x[:, 0], "x2": x[:, 1]} for t, x in runs]
     recording = gfnn.Recording(tables, positions=["x1", "x2"], angles=[])
     windows = samples_of(recording).problem.windows
-    few = dataclasses.replace(windows_module.OPTIONS, most=100)
-    monkeypatch.setattr(windows_module, "OPTIONS", few)
+    monkeypatch.setattr(windows_module.Options, "most", 100)
     parts = list(windows.parts(4))
     assert len(parts) > 1
     np.testing.assert_allclose(

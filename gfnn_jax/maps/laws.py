@@ -28,7 +28,6 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import sizes, split
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the steps of a law's map (benchmarks/speed.py)."""
 
@@ -39,9 +38,6 @@ class Options:
     stiffest: float = 30.0
     test_states: int = 64  # whose step tells the error of these
     nearly: float = 0.95  # of them, whose steps are to be within the tolerance
-
-
-OPTIONS = Options()
 
 
 def map_of_law(
@@ -74,7 +70,7 @@ def map_of_law(
     coordinates = Coordinates("cartesian", angles=tuple(angles))
     z, _, centre, covered = lift(np.asarray(z, float), np.asarray(z, float), coordinates)
     whole = tuple(a for a, all_of_it in zip(angles, covered, strict=True) if all_of_it)
-    scale, some = sizes(z), slice(None, None, -(-len(z) // OPTIONS.test_states))
+    scale, some = sizes(z), slice(None, None, -(-len(z) // Options.test_states))
     own = args[some] if parameters else None
     u = None
     if signals is not None:
@@ -240,9 +236,9 @@ def _steps(flow: Flow, z, args, tolerance: float, rate: float) -> Steps:
 
     Substeps of the most stages are halved until nearly all states stay where they are; those that
     do are halved no further, and are what steps of fewer stages are compared with."""
-    dt, most = float(flow.dt), OPTIONS.stages[-1]
+    dt, most = float(flow.dt), Options.stages[-1]
     turned = dt * rate
-    fewest, stiff = turned / OPTIONS.stiffest, bool(turned > OPTIONS.contracting)
+    fewest, stiff = turned / Options.stiffest, bool(turned > Options.contracting)
 
     def after(steps: Steps, lanes: Any = slice(None)) -> np.ndarray:
         given = of_lanes(args, lanes)
@@ -251,8 +247,8 @@ def _steps(flow: Flow, z, args, tolerance: float, rate: float) -> Steps:
     def off(states: np.ndarray, others: np.ndarray) -> np.ndarray:
         return ~(np.abs((states - others) / flow.scale).max(axis=1) <= tolerance)
 
-    least, allowed = OPTIONS.substeps[-1], (1 - OPTIONS.nearly) * len(z)
-    enough = [n for n in OPTIONS.substeps if n >= min(fewest, least)]
+    least, allowed = Options.substeps[-1], (1 - Options.nearly) * len(z)
+    enough = [n for n in Options.substeps if n >= min(fewest, least)]
     reference, moving = after(Steps(most, enough[0])), np.arange(len(z))
     for substeps in enough:
         before = reference[moving]
@@ -262,7 +258,7 @@ def _steps(flow: Flow, z, args, tolerance: float, rate: float) -> Steps:
             break
     else:
         return Steps(most, least, stiff)
-    every = product(OPTIONS.stages, (n for n in enough if n >= substeps))
+    every = product(Options.stages, (n for n in enough if n >= substeps))
     for _, stages, substeps in sorted((s**2 * n, s, n) for s, n in every):
         tried = Steps(stages, substeps, stiff)
         if np.sum(off(after(tried), reference)) <= allowed:

@@ -22,8 +22,7 @@ from gfnn_jax.families.terms import Terms, joined, multiplied, polynomial_terms
 from gfnn_jax.phase_space import TIME
 
 
-@dataclasses.dataclass(frozen=True)
-class ParameterOptions:
+class Options:
     """Tuned on pendulums of varied length, or driven, and on Kepler's problem of varied mass.
 
     harmonics: of a drive, the largest, in turn.
@@ -48,9 +47,6 @@ class ParameterOptions:
     far_from_zero: float = 0.02
 
 
-OPTIONS = ParameterOptions()
-
-
 def angles_and_others(data: Dataset) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """The angles that enter by themselves, and the names of the coordinates that are none."""
     dim, coordinates = data.dim, data.coordinates
@@ -72,9 +68,9 @@ def states_and_functions(
         # A torque that the args say, −∂H/∂θ of θ f(args), is one for all turns of θ.
         names = tuple(coordinate_names(dim)[i] for i in angles)
         turned = Terms(dim, names, tuple(map(tuple, np.eye(len(names), dtype=int).tolist())))
-        found = [joined(modes(dim, angles, plain, *box), turned) for box in OPTIONS.boxes]
+        found = [joined(modes(dim, angles, plain, *box), turned) for box in Options.boxes]
     else:
-        degrees = OPTIONS.polynomials if features is None else OPTIONS.features
+        degrees = Options.polynomials if features is None else Options.features
         cyclic = data.coordinates.cyclic
         found = [
             polynomial_terms(dim, d, cyclic=cyclic, features=features, reversor=reversor)
@@ -99,9 +95,9 @@ def functions_of_parameters(
     none = [Terms(dim, (), ((),), parameters)] if own else []
     if period is None:
         powers = _powers(dim, parameters, args)
-        series = [_chebyshev(dim, parameters, args, degree) for degree in OPTIONS.degrees]
+        series = [_chebyshev(dim, parameters, args, degree) for degree in Options.degrees]
         return [[*none, powers], series]
-    in_time = [_harmonics(dim, parameters, most, period) for most in OPTIONS.harmonics]
+    in_time = [_harmonics(dim, parameters, most, period) for most in Options.harmonics]
     if len(parameters) == 1:
         return [[*none, *in_time]]
     others = functions_of_parameters(dim, parameters[:-1], args[:, :-1], False)
@@ -133,8 +129,8 @@ def _harmonics(dim: int, parameters: tuple[str, ...], most: int, period: float) 
 def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
     """Products of whole powers, negative ones where a parameter keeps away from 0."""
     inverse = [keeps_away(column) for column in args.T]
-    ranges = [range(-OPTIONS.powers if i else 0, OPTIONS.powers + 1) for i in inverse]
-    exponents = [e for e in product(*ranges) if sum(map(abs, e)) <= OPTIONS.total]
+    ranges = [range(-Options.powers if i else 0, Options.powers + 1) for i in inverse]
+    exponents = [e for e in product(*ranges) if sum(map(abs, e)) <= Options.total]
     variables = (*parameters, *(f"1/{name}" for name in parameters))
     rows = tuple((*(max(a, 0) for a in e), *(max(-a, 0) for a in e)) for e in exponents)
     return Terms(dim, variables, rows, parameters)
@@ -143,7 +139,7 @@ def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
 def keeps_away(values) -> bool:
     """Return whether a parameter with these values keeps its sign and away from 0."""
     size = np.abs(values)
-    return bool(np.ptp(np.sign(values)) == 0 and size.min() > OPTIONS.far_from_zero * size.max())
+    return bool(np.ptp(np.sign(values)) == 0 and size.min() > Options.far_from_zero * size.max())
 
 
 def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int) -> Terms:
@@ -153,7 +149,7 @@ def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int) -> Term
         if (
             values.min() > 0
             and keeps_away(values)
-            and np.ptp(np.log(values)) > np.log(OPTIONS.apart)
+            and np.ptp(np.log(values)) > np.log(Options.apart)
         ):
             name, values = f"log({name})", np.log(values)
         centre, half = 0.5 * (values.max() + values.min()), 0.5 * np.ptp(values)
@@ -197,13 +193,13 @@ def walked(
                 tried.append((family.num_parameters, error, (more, further)))
                 if best <= bound:
                     return
-                if error < OPTIONS.leap * here:
+                if error < Options.leap * here:
                     break
             # The smallest of those that are hardly worse than the best.
             lowest = min((error for _, error, _ in tried), default=np.inf)
-            near = [entry for entry in tried if OPTIONS.gained * entry[1] <= lowest]
+            near = [entry for entry in tried if Options.gained * entry[1] <= lowest]
             _, error, move = min(near, default=(0, np.inf, (0, 0)))
-            if error < OPTIONS.gained * here:
+            if error < Options.gained * here:
                 at, level, here = at + move[0], level + move[1], error
                 moves = [(0, 1), (1, 0), (1, 1)]
                 if move[0] and not move[1]:  # what has helped may help again

@@ -16,10 +16,10 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.rigid_bodies import EARTH, PER_LINK, of_pseudo_inertia, pseudo_inertias
 from gfnn_jax.models.arms.identify import (
     KINDS,
-    OPTIONS,
     Columns,
     Identified,
     Motion,
+    Options,
     Prior,
     base_parameters,
     identified,
@@ -119,7 +119,7 @@ class Arm:
             kinematics = kinematics._replace(prior=kinematics.prior * abs(factor))
         prior, start = prior_of(kinematics, motion, columns)
         rms = np.sqrt(np.mean(motion.v**2, axis=0))
-        moving = rms * min(OPTIONS.widths)
+        moving = rms * min(Options.widths)
         found = identified(columns, motion.without(np.abs(motion.v) < moving), prior, start, report)
         _check_forces(found, motion, recording.inputs, gains, factor if kinematics.known else 1.0)
         base, swing = base_parameters(found, motion)
@@ -194,7 +194,7 @@ def prior_of(kinematics: Kinematics, motion: Motion, columns: Columns) -> tuple[
     force = np.where(motion.heard, np.std(np.nan_to_num(motion.force), axis=0), 1.0) + 1e-300
     speed = np.where(motion.heard, np.sqrt(np.mean(motion.v**2, axis=0)), 1.0) + 1e-300
     lost = [force / speed ** {"linear": 1, "quadratic": 2, "dry": 0}[k] for k in columns.kinds]
-    sizes = OPTIONS.reflected * np.concatenate([felt, *lost])
+    sizes = Options.reflected * np.concatenate([felt, *lost])
     start = np.concatenate([pi, sizes[: bodies.dim], np.zeros(bodies.dim), sizes[bodies.dim :]])
     return Prior(inertias, sizes), start
 
@@ -209,12 +209,12 @@ def _limited(motion: Motion, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray
     forces, which go beyond them. limits: (k,), inf where not known; a largest force that many
     samples share, and no other one, is a limit too."""
     size, beyond = np.abs(motion.force), np.zeros(len(limits), bool)
-    at = size >= OPTIONS.saturated * limits
+    at = size >= Options.saturated * limits
     for i, own in enumerate(size.T):
-        beyond[i] = at[:, i].any() and np.median(own[at[:, i]]) > limits[i] / OPTIONS.saturated
+        beyond[i] = at[:, i].any() and np.median(own[at[:, i]]) > limits[i] / Options.saturated
         top = own >= (1 - 1e-9) * own.max()
         _, counts = np.unique(own[~top & (own > 0)], return_counts=True)
-        if top.sum() > max(OPTIONS.plateau * len(own), 10 * counts.max(initial=1)):
+        if top.sum() > max(Options.plateau * len(own), 10 * counts.max(initial=1)):
             at[:, i] |= top
     return at & ~beyond, beyond
 
@@ -228,7 +228,7 @@ def _check_forces(
     columns, given = found.columns, np.flatnonzero(motion.heard).tolist()
     names, k = np.array(columns.bodies.names), columns.bodies.dim
     known = np.flatnonzero(np.isfinite(motion.force[:, given]).all(axis=1))
-    known = known[:: 1 + len(known) // OPTIONS.block]
+    known = known[:: 1 + len(known) // Options.block]
     rows = columns.rows(motion.q[known], motion.v[known], motion.a[known])
     force = np.nan_to_num(motion.force[known])
     scale = np.where(motion.heard, np.std(force, axis=0), 1.0) + 1e-300
@@ -247,7 +247,7 @@ def _check_forces(
         at = np.repeat(np.array(own) == free, len(tables[0]))
         if free is not None:
             A, b = np.column_stack([A, np.where(at, -b, 0.0)]), np.where(at, 0.0, b)
-        x = np.linalg.lstsq(A, b, rcond=OPTIONS.dependent)[0]
+        x = np.linalg.lstsq(A, b, rcond=Options.dependent)[0]
         left = np.linalg.norm((A @ x - b).reshape(len(own), -1), axis=1) / np.sqrt(len(known))
         return x, left / np.where(at[:: len(tables[0])], abs(x[-1]) + 1e-300, 1.0)
 
@@ -255,9 +255,9 @@ def _check_forces(
     alone = np.array([solved([i], order)[1][0] for i in given])
     left = (found.residual / scale)[given]
     noise = np.nanstd(np.diff(motion.force[:, given], 2, axis=0), axis=0) / np.sqrt(6)
-    explained = np.maximum(OPTIONS.explained, 1 - alone**2 - OPTIONS.apart)
+    explained = np.maximum(Options.explained, 1 - alone**2 - Options.apart)
     poor = (1 - left**2 < explained) & (left > 3 * noise / scale[given])
-    far = not 1 / OPTIONS.units < factor < OPTIONS.units
+    far = not 1 / Options.units < factor < Options.units
     sized = f"{factor:.2g} times those that the inertias of the URDF need"
     _, slope, _ = columns.friction.tables(motion.v[known])
     speeds = motion.v[known][:, given]
@@ -276,7 +276,7 @@ def _check_forces(
             "the forces take energy from the motion of every joint. Their sign is wrong: "
             f"{_given(-gains)}"
         )
-    if far and np.max(together) < OPTIONS.mended:
+    if far and np.max(together) < Options.mended:
         unit = _unit(factor)
         raise FitError(
             f"the forces are {sized}: another unit or sign. {_given(gains / unit)}"
@@ -290,11 +290,11 @@ def _check_forces(
         turned[i], turned[j] = j, i
         trials.append((turned, None))
     tried = [solved(given, of, free) for of, free in trials]
-    worse = [float(np.max(rest / (alone + OPTIONS.mended))) for _, rest in tried]
+    worse = [float(np.max(rest / (alone + Options.mended))) for _, rest in tried]
     best = int(np.argmin([*worse, np.inf]))
-    mends = min(worse, default=np.inf) < 0.5 * np.max(together / (alone + OPTIONS.mended))
+    mends = min(worse, default=np.inf) < 0.5 * np.max(together / (alone + Options.mended))
     odd = mends and trials[best][1] is not None and abs(np.log(abs(tried[best][0][-1])))
-    if not (far or poor.any() or odd > np.log(OPTIONS.units)):
+    if not (far or poor.any() or odd > np.log(Options.units)):
         return
     poor |= not poor.any()
     said = f"the forces of {', '.join(names[given][poor])} do not go with the motion"
@@ -319,7 +319,7 @@ def _check_forces(
 def _unit(factor: float) -> float | None:
     """The power of ten, of either sign, that a factor is near."""
     near = float(np.sign(factor) * 10.0 ** np.round(np.log10(abs(factor))))
-    return near if abs(factor / near - 1) < OPTIONS.apart else None
+    return near if abs(factor / near - 1) < Options.apart else None
 
 
 def _given(gains: np.ndarray) -> str:

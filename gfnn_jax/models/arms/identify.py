@@ -28,8 +28,7 @@ from gfnn_jax.fitting.evidence import correlation_time
 from gfnn_jax.fitting.triangle import Triangle
 
 
-@dataclasses.dataclass(frozen=True)
-class IdentifyOptions:
+class Options:
     """Options of an arm's identification (`benchmarks/arms.py`).
 
     prior: weight γ of the prior, in independent residuals. reflected: a rotor's inertia that is
@@ -64,7 +63,6 @@ class IdentifyOptions:
     most: int = 200
 
 
-OPTIONS = IdentifyOptions()
 KINDS = {"linear": LINEAR, "quadratic": QUADRATIC, "dry": DRY}
 
 
@@ -133,8 +131,8 @@ class Columns:
 
     def blocks(self, motion: Motion) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """(rows (n, k, count), forces (n, k)) of the samples, some at a time."""
-        for first in range(0, len(motion.q), OPTIONS.block):
-            own = slice(first, first + OPTIONS.block)
+        for first in range(0, len(motion.q), Options.block):
+            own = slice(first, first + Options.block)
             yield self.rows(motion.q[own], motion.v[own], motion.a[own]), motion.force[own]
 
     def residuals(self, motion: Motion, x: np.ndarray) -> np.ndarray:
@@ -158,7 +156,7 @@ class Prior:
 
     inertias: np.ndarray
     sizes: np.ndarray
-    weight: float = OPTIONS.prior
+    weight: float = Options.prior
 
     @property
     def inverse(self) -> np.ndarray:
@@ -199,7 +197,7 @@ def minimum(
         )
 
     x, value = start, cost(start)
-    for _ in range(OPTIONS.most):
+    for _ in range(Options.most):
         turned = np.linalg.inv(pseudo_inertias(x[:rigid]))[:, None] @ PSEUDO
         slope, hessian = normal @ x - target, normal.copy()
         slope[:rigid] += prior.weight * (along - np.trace(turned, axis1=2, axis2=3).ravel())
@@ -211,7 +209,7 @@ def minimum(
         scale = 1 / np.sqrt(np.diag(hessian))
         step = -scale * np.linalg.solve(scale[:, None] * hessian * scale, scale * slope)
         fall, share = -slope @ step, 1.0
-        if fall < OPTIONS.converged * (1 + abs(value)):
+        if fall < Options.converged * (1 + abs(value)):
             break
         while (tried := cost(x + share * step)) > value - 0.25 * share * fall and share > 1e-9:
             share *= 0.5
@@ -235,15 +233,15 @@ def widths_of(columns: Columns, motion: Motion) -> np.ndarray:
         rms = np.sqrt(np.mean(v**2))
         sizes = np.linalg.norm(own, axis=0)
         u, s, _ = np.linalg.svd(own[:, sizes > 0] / sizes[sizes > 0], full_matrices=False)
-        u = u[:, s > OPTIONS.dependent * s[0]]
+        u = u[:, s > Options.dependent * s[0]]
         force = motion.force[known, i]
         force = force - u @ (u.T @ force)
         gains = []
-        for width in rms * np.array(OPTIONS.widths):
+        for width in rms * np.array(Options.widths):
             shape = v / np.hypot(v, width)
             shape = shape - u @ (u.T @ shape)
             gains.append((shape @ force) ** 2 / (shape @ shape))
-        found[i] = rms * OPTIONS.widths[int(np.argmax(gains))]
+        found[i] = rms * Options.widths[int(np.argmax(gains))]
     return np.where(motion.heard, found, found.max())
 
 
@@ -271,7 +269,7 @@ def identified(
     size = np.sqrt(np.nansum(motion.force**2, axis=0) / known)
     size[size == 0] = 1.0
     sigma, x = size.copy(), start
-    for number in range(OPTIONS.rounds):
+    for number in range(Options.rounds):
         report(f"parameters of the arm, round {number + 1}")
         triangle = columns.triangle(motion, sigma)
         x, hessian = minimum(triangle, columns, prior, x)
@@ -308,7 +306,7 @@ class BaseParameters:
     @property
     def determined(self) -> np.ndarray:
         """Mask (m,) of those that the data tell, to a part of their size or of the prior."""
-        return self.errors < OPTIONS.sharpened * np.maximum(self.expected, np.abs(self.values))
+        return self.errors < Options.sharpened * np.maximum(self.expected, np.abs(self.values))
 
 
 def base_parameters(found: Identified, motion: Motion) -> tuple[BaseParameters, str | None]:
@@ -321,18 +319,18 @@ def base_parameters(found: Identified, motion: Motion) -> tuple[BaseParameters, 
     columns, bodies = found.columns, found.columns.bodies
     k, rng = bodies.dim, np.random.default_rng(0)
     rigid = dataclasses.replace(columns, kinds=())
-    q, v, a = rng.uniform(-np.pi, np.pi, (3, OPTIONS.structure, k))
+    q, v, a = rng.uniform(-np.pi, np.pi, (3, Options.structure, k))
     rows = rigid.rows(q, v, a).reshape(-1, rigid.count)
     within = [4, 5, 6, 7, 8, 9, 1, 2, 3, 0]  # the mass last: it is what moves into others
     order = [PER_LINK * i + j for i in range(k) for j in within]
     order += range(PER_LINK * k, rigid.count)
     sizes = np.linalg.norm(rows, axis=0)
-    some = [j for j in order if sizes[j] > OPTIONS.dependent * sizes.max()]
+    some = [j for j in order if sizes[j] > Options.dependent * sizes.max()]
     R = np.asarray(np.linalg.qr(rows[:, some] / sizes[some], mode="r"))
-    free = np.abs(np.diag(R)) > OPTIONS.dependent
+    free = np.abs(np.diag(R)) > Options.dependent
     own, rest = np.flatnonzero(free), np.flatnonzero(~free)
     mixed = np.linalg.lstsq(R[:, own], R[:, rest], rcond=None)[0]
-    mixed = np.where(np.abs(mixed) > OPTIONS.dependent, mixed, 0.0)
+    mixed = np.where(np.abs(mixed) > Options.dependent, mixed, 0.0)
     turn, added = np.zeros((len(own), columns.count)), [some[r] for r in rest]
     for row, j in enumerate(own):
         turn[row, some[j]] = 1.0
@@ -350,7 +348,7 @@ def base_parameters(found: Identified, motion: Motion) -> tuple[BaseParameters, 
     if base.determined.all():
         return base, None
     noise = np.where(found.residual > 0, found.residual, found.residual.max() or 1.0)[:, None]
-    poses, told = motion.q[rng.integers(len(motion.q), size=OPTIONS.structure)], []
+    poses, told = motion.q[rng.integers(len(motion.q), size=Options.structure)], []
     for unit in np.eye(k):
         swing, v, a = rng.uniform(-np.pi, np.pi, (3, len(poses), 1)) * unit
         q = np.where(unit, swing, poses)
@@ -366,8 +364,8 @@ def _errors(A: np.ndarray) -> np.ndarray:
     empty, scale = scale == 0, np.where(scale == 0, 1.0, scale)
     _, s, vt = np.linalg.svd(A / scale, full_matrices=False)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(s > OPTIONS.dependent * s[0], 1 / s, np.inf)
-        parts = np.where(np.abs(vt.T) > OPTIONS.dependent, vt.T * inverse, 0.0)
+        inverse = np.where(s > Options.dependent * s[0], 1 / s, np.inf)
+        parts = np.where(np.abs(vt.T) > Options.dependent, vt.T * inverse, 0.0)
     return np.where(empty, np.inf, np.linalg.norm(parts, axis=1) / scale)
 
 
@@ -376,7 +374,7 @@ def _sum(row: np.ndarray, names: list[str]) -> str:
     listed = np.flatnonzero(row)
     text = ""
     for j in listed:
-        size = "" if abs(abs(row[j]) - 1.0) < OPTIONS.dependent else f"{abs(row[j]):.3g} "
+        size = "" if abs(abs(row[j]) - 1.0) < Options.dependent else f"{abs(row[j]):.3g} "
         sign = "-" if row[j] < 0 else "+"
         text += f" {sign} {size}{names[j]}" if text else f"{size}{names[j]}"
     return text

@@ -17,7 +17,7 @@ from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import stiffness
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.arms.identify import OPTIONS, BaseParameters, Identified
+from gfnn_jax.models.arms.identify import BaseParameters, Identified, Options
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.linear import covariance_root
 
@@ -76,7 +76,7 @@ class LearnedArm:
         expected = np.abs(rows)
         expected[1:] = np.maximum(expected[1:], found.prior.sizes[k:].reshape(-1, k))
         expected[0] = np.maximum(expected[0], self.base.expected[-k:])
-        told = np.where(errors < OPTIONS.sharpened * expected, [rows, errors], np.nan)
+        told = np.where(errors < Options.sharpened * expected, [rows, errors], np.nan)
         kinds = ("offset", *found.columns.kinds)
         return {
             name: dict(zip(kinds, map(tuple, told[:, :, i].T.tolist()), strict=True))

@@ -8,7 +8,6 @@ Killing form and ideals of dimension three; se(3) has three rotations that turn 
 aff(1)^k, {a_i, b_i} = a_i, has what commutes and what the rest multiplies. NumPy.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from gfnn_jax.brackets import standard_constants
 from gfnn_jax.models.brackets.poisson_field import sparse
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the analysis of an algebra."""
 
@@ -27,8 +25,6 @@ class Options:
     mixtures: int = 20  # of what commutes with the algebra, of which the best is taken
     seed: int = 0
 
-
-OPTIONS = Options()
 
 _EPSILON = standard_constants(("so3",))
 
@@ -53,7 +49,7 @@ def killing(c: np.ndarray) -> np.ndarray:
     return np.einsum("iab,jba->ij", c, c)
 
 
-def analysed(c: np.ndarray, zero: float = OPTIONS.zero) -> Algebra:
+def analysed(c: np.ndarray, zero: float = Options.zero) -> Algebra:
     """Name an algebra and bring it to standard constants. zero: relative, below which eigenvalues
     of the Killing form are none."""
     form = killing(c)
@@ -118,8 +114,8 @@ def _rotations(c: np.ndarray, form: np.ndarray) -> np.ndarray | None:
     count = n // 3
     kernel = vt[-count:].reshape(count, n, n)
     # a symmetric combination, whose eigenspaces the factors are: that of the widest gaps
-    rng = np.random.default_rng(OPTIONS.seed)
-    mixed = np.tensordot(rng.normal(size=(OPTIONS.mixtures, count)), kernel, 1)
+    rng = np.random.default_rng(Options.seed)
+    mixed = np.tensordot(rng.normal(size=(Options.mixtures, count)), kernel, 1)
     values, vectors = np.linalg.eigh(mixed + mixed.swapaxes(1, 2))
     apart = np.diff(values[:, 1::3], axis=1).min(axis=1, initial=np.inf) / np.ptp(values, axis=1)
     vectors = vectors[np.argmax(apart)]
@@ -153,7 +149,7 @@ def _aligned(rows: np.ndarray) -> np.ndarray:
 def _scalings(c: np.ndarray, zero: float) -> Algebra | None:
     """aff(1)^k + R^m: what an element h of general position multiplies, a_i with {a_i, h} = λ_i a_i
     to real and different λ_i, and as many b_i of those that commute with h; None of any other."""
-    h = np.random.default_rng(OPTIONS.seed).normal(size=len(c))
+    h = np.random.default_rng(Options.seed).normal(size=len(c))
     turned = np.einsum("ijk,j->ki", c, h)  # of an element, by its coordinates: {·, h}
     values, vectors = np.linalg.eig(turned)
     limit = np.sqrt(zero) * np.abs(values).max(initial=0.0)

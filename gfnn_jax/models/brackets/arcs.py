@@ -23,7 +23,6 @@ from gfnn_jax.solve.latent_arcs import (
 )
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of fits to arcs (benchmarks/brackets.py)."""
 
@@ -39,9 +38,6 @@ class Options:
     states: int = 400  # at which the field's rates are taken
     # of the noise: residuals that are none
     least: float = 1e-3
-
-
-OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,17 +152,17 @@ def fit_arcs(
     below four standard errors are dropped, the weaker half of them at a time, for terms that are
     alike hide one another; constants that may be whole numbers are. sigma: (n,) noise to start
     from."""
-    some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // OPTIONS.states)]
+    some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // Options.states)]
     rate = np.quantile(np.abs(field.jacobian(c, some)).sum(axis=2).max(axis=1), 0.99)
-    substeps = int(np.clip(np.ceil(rate * dt / OPTIONS.rate), 1, OPTIONS.most_substeps))
+    substeps = int(np.clip(np.ceil(rate * dt / Options.rate), 1, Options.most_substeps))
 
     def fitted_to(field: PoissonField, free: FreeBracket, p: np.ndarray, x: np.ndarray) -> Fitted:
         model = PoissonArcs(field, free, dt, substeps)
-        return Readings(model, y, sigma).fit(p, x, sigma, least=OPTIONS.least * sigma)
+        return Readings(model, y, sigma).fit(p, x, sigma, least=Options.least * sigma)
 
     free = FreeBracket.of(field.bracket)
     fitted = fitted_to(field, free, np.concatenate([c, free.values]), y)
-    for _ in range(OPTIONS.rounds):
+    for _ in range(Options.rounds):
         count = field.num
         errors = np.sqrt(np.sum(_root(fitted)[:, :count] ** 2, axis=0))
         strength = np.abs(fitted.p[:count]) / np.maximum(errors, 1e-300)
@@ -179,14 +175,14 @@ def fit_arcs(
         fitted = fitted_to(field, free, p, fitted.x)
     count = field.num
     values = fitted.p[count:]
-    whole = np.abs(values - np.round(values)) <= OPTIONS.near
+    whole = np.abs(values - np.round(values)) <= Options.near
     if whole.any():
         bracket = free.moved(np.where(whole, np.round(values), values))
         fixed = FreeBracket(bracket, free.places[~whole])
         p = np.concatenate([fitted.p[:count], values[~whole]])
         tried = fitted_to(field, fixed, p, fitted.x)
         sizes = [np.sum(one.residuals**2 * (one.sigma / sigma) ** 2) for one in (tried, fitted)]
-        if sizes[0] - sizes[1] <= OPTIONS.whole * whole.sum():
+        if sizes[0] - sizes[1] <= Options.whole * whole.sum():
             free, fitted = fixed, tried
     found = field.with_bracket(free.moved(fitted.p[count:]))
     left = fitted.sigma * np.sqrt(np.mean(fitted.residuals.reshape(-1, y.shape[2]) ** 2, axis=0))
@@ -211,9 +207,9 @@ def equal_arcs(sequences: list[np.ndarray]) -> np.ndarray:
     """The sequences cut into arcs of one length (A, L, n), the longest that leaves few states out:
     an arc begins with the state that the one before ends with; what is shorter is left out."""
     ends = np.array([len(states) for states in sequences]) - 1
-    lengths = np.arange(min(OPTIONS.nodes - 1, ends.max()), 0, -1)
+    lengths = np.arange(min(Options.nodes - 1, ends.max()), 0, -1)
     used = np.array([np.sum(ends // length * length) for length in lengths])
-    length = lengths[np.argmax(used >= OPTIONS.used * used.max())] + 1
+    length = lengths[np.argmax(used >= Options.used * used.max())] + 1
     parts = [
         states[first : first + length]
         for states in sequences

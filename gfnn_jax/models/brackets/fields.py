@@ -24,7 +24,6 @@ from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.phase_space import sizes
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the fit of a field (benchmarks/brackets.py)."""
 
@@ -43,9 +42,6 @@ class Options:
     # singular value ÷ the largest, columns of unit length, below which pairs without noise do not
     # determine a combination of terms
     undetermined: float = 1e-10
-
-
-OPTIONS = Options()
 
 
 @runtime_checkable
@@ -104,7 +100,7 @@ class Partials:
         columns = np.flatnonzero(sizes > 0)
         found: Any = qr(every[:, columns] / sizes[columns], mode="economic", pivoting=True)
         _, r, order = found
-        rank = int(np.sum(np.abs(np.diag(r)) > OPTIONS.undetermined * abs(r[0, 0])))
+        rank = int(np.sum(np.abs(np.diag(r)) > Options.undetermined * abs(r[0, 0])))
         return cls(terms, tuple(sorted(columns[order[:rank]].tolist())))
 
     @property
@@ -168,19 +164,19 @@ class Flowed(NamedTuple):
 
 def flow(field: Field, c: np.ndarray, z0: np.ndarray, dt: Any, substeps: int = 1) -> Flowed:
     """The flow of f over dt, a number or (N,), from z0 (N, n): NaN where stages do not converge."""
-    rule, h = gauss(OPTIONS.stages), np.reshape(dt, (-1, 1)) / substeps
+    rule, h = gauss(Options.stages), np.reshape(dt, (-1, 1)) / substeps
     z, nodes, scale = z0, [], sizes(z0)
     matrix = rule.matrix
     with np.errstate(all="ignore"):
         for _ in range(substeps):
-            slopes = np.repeat(field.rate(c, z)[None], OPTIONS.stages, axis=0)
+            slopes = np.repeat(field.rate(c, z)[None], Options.stages, axis=0)
             change = np.inf
-            for _ in range(OPTIONS.most_stage_iterations):
+            for _ in range(Options.most_stage_iterations):
                 inside = z + h * np.tensordot(matrix, slopes, 1)
                 new = field.rate(c, inside.reshape(-1, z.shape[1])).reshape(inside.shape)
                 moved = np.nanmax(np.abs(h * (new - slopes)) / scale, initial=0.0)
                 slopes = new
-                if (not moved < 0.99 * change and moved < 1e-9) or moved <= OPTIONS.solved:
+                if (not moved < 0.99 * change and moved < 1e-9) or moved <= Options.solved:
                     break
                 change = moved
             nodes.append(inside)
@@ -195,7 +191,7 @@ def substeps_of(field: Field, c: np.ndarray, z: np.ndarray, dt: Any) -> int:
     rates = np.abs(field.jacobian(c, z)).sum(axis=2).max(axis=1) * np.reshape(dt, -1)
     rates = rates[np.isfinite(rates)]
     fastest = float(np.quantile(rates, 0.99)) if len(rates) else 0.0
-    return int(np.clip(np.ceil(fastest / OPTIONS.rate), 1, OPTIONS.most_substeps))
+    return int(np.clip(np.ceil(fastest / Options.rate), 1, Options.most_substeps))
 
 
 class FieldFit(NamedTuple):
@@ -256,12 +252,12 @@ def fit_field(
     """
     h, spread = np.reshape(dt, (-1, 1)), sizes(np.concatenate([z0, z1]))
     if c is None:
-        rule = gauss(OPTIONS.stages)
+        rule = gauss(Options.stages)
         straight = z0 + rule.nodes[:, None, None] * (z1 - z0)
         c = _least(_columns(field, straight, rule.weights, h), z1 - z0, spread)[0]
     at = np.array(c)
     here = path_of(field, at, z0, z1, dt, spread)
-    for _ in range(OPTIONS.most_halvings):
+    for _ in range(Options.most_halvings):
         if here.relative < np.inf:
             break
         at *= 0.5
@@ -269,17 +265,17 @@ def fit_field(
     if here.relative == np.inf:
         raise FitError("no field of the library has a flow over dt: take pairs of a shorter dt")
     iterations = 0
-    while here.relative > OPTIONS.roundoff and iterations < OPTIONS.most_iterations:
+    while here.relative > Options.roundoff and iterations < Options.most_iterations:
         iterations += 1
         stepped, gains = _step(field, at, here, h, spread)
         before = here.relative
-        for share in OPTIONS.shares if gains else OPTIONS.shares[:1]:
+        for share in Options.shares if gains else Options.shares[:1]:
             there = stepped(share)
             path = path_of(*there, z0, z1, dt, spread)
             if path.relative < before:
                 (field, at), here = there, path
                 break
-        if not here.relative < OPTIONS.gain * before:
+        if not here.relative < Options.gain * before:
             break
     free = max(1.0, here.residual.size - field.num)
     root = _least(_columns(field, here.nodes, here.weights, h), here.residual, spread)[1]
@@ -311,7 +307,7 @@ def _step(
             target = path.target - (new - own) @ c
         return moved, c + (_least(new, target, spread)[0] if np.isfinite(target).all() else np.nan)
 
-    return stepped, bool(size[0] < OPTIONS.gain**2 * size[1])
+    return stepped, bool(size[0] < Options.gain**2 * size[1])
 
 
 def _mean(columns: Callable[[np.ndarray], np.ndarray], nodes, weights, h) -> np.ndarray:
@@ -333,7 +329,7 @@ def _least(columns, target, spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     free = columns.shape[1] != target.shape[1]  # the same columns for each component
     matrix = columns[:, 0] if free else (columns / spread[:, None]).reshape(target.size, -1)
     right = target if free else (target / spread).ravel()
-    spectrum = Spectrum.of(matrix, right, 0.0, OPTIONS.dependent)
+    spectrum = Spectrum.of(matrix, right, 0.0, Options.dependent)
     one = spectrum.told
     solved = one.T @ spectrum.along
     left = right - matrix @ solved
@@ -345,6 +341,6 @@ def _least(columns, target, spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def undetermined(field: FreeField, z: np.ndarray, floor: float) -> np.ndarray:
     """Combinations (m, K) of the library that vanish at all states z (N, n), to ``floor`` or to
     roundoff: relations that the runs have in common, as one value of an invariant."""
-    values, cutoff = field.library.term_values(z), max(OPTIONS.undetermined, floor)
+    values, cutoff = field.library.term_values(z), max(Options.undetermined, floor)
     spectrum = Spectrum.of(values, values[:, 0], 0.0, cutoff)
     return spectrum.vt[~spectrum.known] / spectrum.column

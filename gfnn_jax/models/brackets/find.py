@@ -29,7 +29,6 @@ from gfnn_jax.models.brackets.poisson_field import (
 )
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the choice among brackets (benchmarks/brackets.py)."""
 
@@ -42,9 +41,6 @@ class Options:
     starts: int = 6  # random combinations of several null vectors, brought to Jacobi's identity
     places: int = 12  # of largest constants, at which null vectors of few constants are looked for
     seed: int = 0
-
-
-OPTIONS = Options()
 
 
 class Found(NamedTuple):
@@ -62,7 +58,7 @@ class Found(NamedTuple):
         """Order of preference, least first."""
         blocks = getattr(self.field.bracket, "blocks", None)
         return (
-            self.hamiltonian.misfit > OPTIONS.misfit,
+            self.hamiltonian.misfit > Options.misfit,
             blocks == (),
             self.several_terms,
         )
@@ -71,7 +67,7 @@ class Found(NamedTuple):
     def several_terms(self) -> int:
         """Number of constants of the bracket."""
         bracket = self.field.bracket
-        probe = np.random.default_rng(OPTIONS.seed).uniform(0.5, 1.5, bracket.size)
+        probe = np.random.default_rng(Options.seed).uniform(0.5, 1.5, bracket.size)
         return len(bracket.relations()) + int(np.count_nonzero(bracket.matrix(probe)))
 
 
@@ -128,7 +124,7 @@ def brackets_of(
             for bracket, name in _made(null, vector, names, noise, states)
         ]
         least = min((own.misfit for *_, own in made), default=0.0)
-        limit = min(max(OPTIONS.misfit, 3 * noise), OPTIONS.rounded * least + OPTIONS.misfit)
+        limit = min(max(Options.misfit, 3 * noise), Options.rounded * least + Options.misfit)
         for name, field, own in made:
             if own.misfit <= limit:
                 found.append(Found(field, name, own, len(null.vectors), rule))
@@ -149,16 +145,16 @@ def _combinations(null: NullSpace, z: np.ndarray, noise: float) -> Iterator[tupl
         return
     if null.tensors.width == 3:
         yield _nearest_sphere(null, rows, z), "the one whose Casimir is nearest to a sphere"
-    yield from ((row, few) for row in rows if _jacobi(null, row) <= max(OPTIONS.zero, noise))
-    rng, many = np.random.default_rng(OPTIONS.seed), null.tensors.width > 6
-    for _ in range(0 if many else OPTIONS.starts):
+    yield from ((row, few) for row in rows if _jacobi(null, row) <= max(Options.zero, noise))
+    rng, many = np.random.default_rng(Options.seed), null.tensors.width > 6
+    for _ in range(0 if many else Options.starts):
         start = rng.normal(size=len(rows))
         start /= np.linalg.norm(start)
         solved = least_squares(
             lambda t: np.append(_identity(_constants(null, t @ rows)[1]).ravel(), t @ t - 1), start
         )
         vector = solved.x @ rows
-        if _jacobi(null, vector) <= max(OPTIONS.zero, noise):
+        if _jacobi(null, vector) <= max(Options.zero, noise):
             yield vector, few
 
 
@@ -167,14 +163,14 @@ def sparse_rows(vectors: np.ndarray) -> np.ndarray:
     one of least Σ|x_j| whose entry at one place is 1 (Spielman, Wang & Wright, COLT 2012)."""
     found = list(vectors)
     size = np.linalg.norm(vectors, axis=0)
-    places = np.argsort(-size)[: OPTIONS.places]
-    for place in places[size[places] > OPTIONS.zero * size.max()]:
+    places = np.argsort(-size)[: Options.places]
+    for place in places[size[places] > Options.zero * size.max()]:
         first = vectors[:, place] / (vectors[:, place] @ vectors[:, place])
         others = np.linalg.svd(vectors[:, place][None], full_matrices=True)[2][1:]
         found.append(sparse(first @ vectors, others @ vectors))
     found = [x / np.abs(x).max() for x in found]
     rows: list[np.ndarray] = []
-    for x in sorted(found, key=lambda x: int((np.abs(x) > OPTIONS.zero).sum())):
+    for x in sorted(found, key=lambda x: int((np.abs(x) > Options.zero).sum())):
         if np.linalg.matrix_rank(np.array([*rows, x]), tol=1e-6) > len(rows):
             rows.append(x)
     return np.array(rows)
@@ -216,8 +212,8 @@ def _nearest_sphere(null: NullSpace, rows: np.ndarray, z: np.ndarray) -> np.ndar
         values = np.linalg.eigvalsh(np.tensordot(t / np.linalg.norm(t), forms, 1))
         return float(np.abs(values).max() / max(np.abs(values.sum()) / 3, 1e-9) + np.ptp(values))
 
-    rng = np.random.default_rng(OPTIONS.seed)
-    starts = rng.normal(size=(OPTIONS.starts, len(rows)))
+    rng = np.random.default_rng(Options.seed)
+    starts = rng.normal(size=(Options.starts, len(rows)))
     best = min((minimize(condition, t, method="Nelder-Mead") for t in starts), key=lambda s: s.fun)
     return (best.x / norms) @ rows
 
@@ -227,7 +223,7 @@ def _made(
 ) -> Iterator[tuple[Bracket, str]]:
     """The bracket of a null vector, in standard constants where there are such and all states z
     (N, n) have a step."""
-    n, zero = null.tensors.width, max(OPTIONS.zero, noise)
+    n, zero = null.tensors.width, max(Options.zero, noise)
     if null.tensors.kind != LINEAR:
         form = np.zeros((n, n))
         for value, (a, b) in zip(vector, null.tensors.places, strict=True):
@@ -240,7 +236,7 @@ def _made(
         return
     form, raw = _constants(null, vector)
     c = np.where(np.abs(raw) > zero * np.abs(raw).max(), raw, 0.0)
-    if np.abs(form).max() > OPTIONS.snapped * zero * np.abs(vector).max():
+    if np.abs(form).max() > Options.snapped * zero * np.abs(vector).max():
         with contextlib.suppress(FitError, np.linalg.LinAlgError):  # not one of a charge
             magnetic = _magnetic(form, c, names, zero)
             if magnetic is not None:
@@ -251,10 +247,10 @@ def _made(
     algebra = next((a for a in tried if a.lifted is not None), tried[0])
     if algebra.lifted is not None:
         basis, inside = sized(algebra, z), False
-        bases = [(basis, OPTIONS.snapped * zero), (basis, zero)]
-        exact = analysed(raw, min(100 * zero, 0.1)) if noise > OPTIONS.zero else algebra
+        bases = [(basis, Options.snapped * zero), (basis, zero)]
+        exact = analysed(raw, min(100 * zero, 0.1)) if noise > Options.zero else algebra
         if exact is not algebra and exact.blocks == algebra.blocks:
-            bases.append((sized(exact, z), OPTIONS.zero))  # constants that are small, and no noise
+            bases.append((sized(exact, z), Options.zero))  # constants that are small, and no noise
         for basis, by in bases:
             with contextlib.suppress(FitError):  # rounded to a singular one
                 bracket = Bracket.lie(algebra.blocks, _rounded(basis, by), names)

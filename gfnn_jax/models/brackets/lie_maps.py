@@ -8,7 +8,6 @@ each from the last S: a chart's x is then known well enough. S is determined up 
 the Casimirs, and on a thin shell up to more: small singular values are left out.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ from gfnn_jax.flows.lie import LieGenerated, lie_generated, mean_of_arc
 from gfnn_jax.phase_space import sizes
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Numbers of the fit."""
 
@@ -40,9 +38,6 @@ class Options:
     most_terms: int = 1000  # of S: more take longer than 12 s (benchmarks/bracket_maps.py)
 
 
-OPTIONS = Options()
-
-
 class LieMap(NamedTuple):
     """Fitted piece, its degree and its held-out error (RMS in units of the coordinates' sizes)."""
 
@@ -55,13 +50,13 @@ def fit_lie_map(z0, z1, bracket: Constant | LieAlgebra, dt: float, degree: int =
     """Fit S up to a total ``degree`` to pairs z0, z1 (N, n) of a Lie algebra or constant bracket;
     the degree with the least held-out error is taken."""
     scale = sizes(np.concatenate([z0, z1]))
-    held = np.arange(len(z0)) % OPTIONS.held == OPTIONS.held - 1
+    held = np.arange(len(z0)) % Options.held == Options.held - 1
     train, test = (_Pairs(bracket, z0[of], z1[of], dt, scale) for of in (~held, held))
     inputs = box_inputs(0.5 * (z0 + z1))
     best, c, family = None, None, None
     for d in range(2, degree + 1):
         terms = number_of_terms(inputs.is_angle, d)
-        most = min(OPTIONS.most_terms, z0[~held].size / OPTIONS.rows_per_term)
+        most = min(Options.most_terms, z0[~held].size / Options.rows_per_term)
         if terms > most:
             break
         larger = Products(inputs, d)
@@ -71,7 +66,7 @@ def fit_lie_map(z0, z1, bracket: Constant | LieAlgebra, dt: float, degree: int =
         error = test.error(family, c)
         if best is None or error < best[2]:
             best = family, c, error
-        elif not error < OPTIONS.worse * best[2]:
+        elif not error < Options.worse * best[2]:
             break
     assert best is not None
     family, c, error = best
@@ -90,11 +85,11 @@ class _Pairs:
     def fitted(self, family: Products, c):
         """Coefficients after Gauss–Newton from c, each step halved until the residual shrinks."""
         residual, by_slope = self.linearised(family, c)
-        for _ in range(OPTIONS.iterations):
+        for _ in range(Options.iterations):
             size, terms = _rms(residual), family.term_gradients(self.x)
             rows = (by_slope @ terms / self.scale[:, None]).reshape(-1, terms.shape[-1])
             step, x = _solved(rows, residual.ravel() + rows @ c) - c, self.x
-            for part in OPTIONS.parts:
+            for part in Options.parts:
                 residual, by_slope = self.linearised(family, c + part * step)
                 if _rms(residual) < size:
                     break
@@ -102,7 +97,7 @@ class _Pairs:
             else:
                 return c
             c = c + part * step
-            if not _rms(residual) < OPTIONS.settled * size:
+            if not _rms(residual) < Options.settled * size:
                 return c
         return c
 
@@ -120,11 +115,11 @@ class _Pairs:
 
         x, eye = self.x, np.eye(z.shape[1])
         gradient, hessian, mean, slope = evaluated(x)
-        for _ in range(OPTIONS.newton):
+        for _ in range(Options.newton):
             step = np.linalg.solve(eye - h * slope @ hessian, (x - mean)[..., None])[..., 0]
             x = x - step
             gradient, hessian, mean, slope = evaluated(x)
-            if not np.abs(step / self.scale).max() > OPTIONS.solved:
+            if not np.abs(step / self.scale).max() > Options.solved:
                 break
         if np.isfinite(x).all():
             self.x = x
@@ -140,7 +135,7 @@ class _Pairs:
 def _solved(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Least squares of least norm, in units of the columns, without small singular values."""
     factor = np.asarray(np.linalg.qr(np.column_stack([rows, target]), mode="r"))
-    found = Spectrum.of(factor[:, :-1], factor[:, -1], 0.0, OPTIONS.truncated)
+    found = Spectrum.of(factor[:, :-1], factor[:, -1], 0.0, Options.truncated)
     return found.solution(found.inverse)
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the null space (benchmarks/brackets.py)."""
 
@@ -28,8 +27,6 @@ class Options:
     draws: int = 12  # of the field's coefficients, that tell this error
     shrinking: float = 0.05  # of f', what L_f B − λB of noisy sequences may leave at all
 
-
-OPTIONS = Options()
 
 CONSTANT, LINEAR, LOG = "constant", "linear", "log"
 
@@ -125,7 +122,7 @@ def null_spaces(
     kinds = (CONSTANT, LINEAR, LOG) if (z > 0).all() else (CONSTANT, LINEAR)
     for kind in kinds:
         tensors = Tensors(kind, z.shape[1])
-        needed = OPTIONS.rows_per_column * tensors.num / len(tensors.places)
+        needed = Options.rows_per_column * tensors.num / len(tensors.places)
         stride = max(1, int(len(z) // max(needed, 30)))
         own = slice(None, None, stride)
         lie = tensors.lie(y[own], f[own], slope[own]).reshape(-1, tensors.num)
@@ -139,7 +136,7 @@ def null_spaces(
         limit = np.array(
             [np.sqrt(np.mean([np.sum((e @ v) ** 2) for e in errors])) / size for v in vt[:8]]
         )
-        allowed = np.maximum(OPTIONS.errors * limit, OPTIONS.null)
+        allowed = np.maximum(Options.errors * limit, Options.null)
         count = int(np.cumprod(values[: len(allowed)] <= allowed).sum())
         vectors = vt[:count] * _back(tensors, scale)
         yield NullSpace(tensors, vectors, values, rate)
@@ -155,7 +152,7 @@ def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray, clean: bool) -> l
     scale = np.sqrt(np.mean(z**2, axis=0))
     y, (f, slope) = z / scale, _in_units(f, slope, scale)
     size, n = np.sqrt(np.mean(np.sum(slope**2, axis=(1, 2)))), z.shape[1]
-    limit = OPTIONS.null if clean else OPTIONS.shrinking
+    limit = Options.null if clean else Options.shrinking
     known: list[tuple[int, float, float]] = []
     for kind in (CONSTANT, LINEAR):
         tensors = Tensors(kind, n)
@@ -176,7 +173,7 @@ def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray, clean: bool) -> l
             bracket = every @ vector
             left = float(np.linalg.norm(lie @ vector - found * bracket) / np.linalg.norm(bracket))
             seen = any(abs(found - other) <= limit * size for *_, other in known)
-            if left <= limit * size and not seen and abs(found) > OPTIONS.null * size:
+            if left <= limit * size and not seen and abs(found) > Options.null * size:
                 form = np.zeros((n, n))
                 form[tuple(np.transpose(tensors.places))] = bracket[: len(tensors.places)]
                 least = max(1e-6, limit) * np.abs(form).max()

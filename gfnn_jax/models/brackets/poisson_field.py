@@ -30,7 +30,6 @@ from gfnn_jax.models.textbook.shapes import text_of, values
 from gfnn_jax.phase_space import TIME, sizes
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of H from a field (benchmarks/brackets.py)."""
 
@@ -43,9 +42,6 @@ class Options:
     exact: float = 1e-11  # of the spread: a residual that is roundoff
     continued: int = 16  # shapes of each round that go through the flow, at most
     near: float = 0.3  # of the best one's part of what is left, that they explain
-
-
-OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,11 +145,11 @@ def hamiltonian_of(
     columns = field.columns(z)[:, : f.shape[1]] / units / scale[:, None]
     matrix, right = columns.reshape(-1, field.num), (f / scale).ravel()
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    known = s > max(OPTIONS.casimir, noise) * s[0]
+    known = s > max(Options.casimir, noise) * s[0]
     c = vt[known].T @ ((u.T @ right)[known] / s[known])
     kernel = np.linalg.svd(vt[known], full_matrices=True)[2][known.sum() :]
     least = sparse(c, kernel)
-    kept = np.abs(least) > max(OPTIONS.zero, noise) * np.abs(least).max(initial=0.0)
+    kept = np.abs(least) > max(Options.zero, noise) * np.abs(least).max(initial=0.0)
     solved = np.zeros(len(c))
     solved[kept] = np.linalg.lstsq(matrix[:, kept], right, rcond=1e-13)[0]
     misfit = float(np.sqrt(np.mean((matrix @ solved - right) ** 2) / np.mean(right**2)))
@@ -231,8 +227,8 @@ def with_shapes(
     middle, rate = 0.5 * (z0 + z1), (z1 - z0) / np.reshape(dt, (-1, 1))
     field = ShapedField.of(bracket, base, ())
     best = fit_field(field, *pairs, hamiltonian_of(field, middle, rate).c)
-    for _ in range(OPTIONS.atoms):
-        if best.relative <= OPTIONS.exact:
+    for _ in range(Options.atoms):
+        if best.relative <= Options.exact:
             break
         found = [best]
         for atom in _next(best, pairs):
@@ -241,7 +237,7 @@ def with_shapes(
                 found.append(fit_field(start, *pairs, np.append(best.c, 0.0)))
                 shape = text(found[-1].field.atoms[-1], base.names)
                 on_progress(f"H with {shape}: {found[-1].relative:.1e}")
-            if found[-1].relative <= OPTIONS.exact:
+            if found[-1].relative <= Options.exact:
                 break
         least = min(found, key=lambda one: one.relative)
         if least is best or least.relative > 0.5 * best.relative:
@@ -250,7 +246,7 @@ def with_shapes(
     # The constants in six digits, which they may be in truth.
     rounded = best.field.with_constants(np.array([float(f"{t:.6g}") for t in best.field.constants]))
     left = path_of(rounded, best.c, *pairs, sizes(np.concatenate([z0, z1]))).relative
-    field = rounded if left <= max(best.relative, OPTIONS.exact) else best.field
+    field = rounded if left <= max(best.relative, Options.exact) else best.field
     return field.library, best.c
 
 
@@ -262,7 +258,7 @@ def text(atom: Factor, names: tuple[str, ...]) -> str:
 def _next(best: FieldFit, pairs: Pairs) -> list[Factor]:
     """The atoms that explain most of what is left, of different shapes."""
     z0, z1, dt = pairs
-    some = slice(None, None, max(1, len(z0) // OPTIONS.rows))
+    some = slice(None, None, max(1, len(z0) // Options.rows))
     z0, z1 = z0[some], z1[some]
     dt = dt[some] if np.ndim(dt) else dt
     field, h, spread = best.field, np.reshape(dt, (-1, 1)), sizes(z0)
@@ -286,7 +282,7 @@ def _next(best: FieldFit, pairs: Pairs) -> list[Factor]:
     found = sorted((one for one in found if np.isfinite(one[0])), key=lambda one: -one[0])
     chosen: dict[Any, Factor] = {}
     for score, atom in found:
-        if score < OPTIONS.near * found[0][0] or len(chosen) == OPTIONS.continued:
+        if score < Options.near * found[0][0] or len(chosen) == Options.continued:
             break
         chosen.setdefault(atom.form, atom)
     return list(chosen.values())

@@ -45,7 +45,6 @@ from gfnn_jax.phase_space import sizes
 from gfnn_jax.signals.noise import noise
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the search for a bracket (benchmarks/brackets.py)."""
 
@@ -80,7 +79,6 @@ class Options:
     seed: int = 0
 
 
-OPTIONS = Options()
 ONE_LEVEL = (
     "H has one value along all runs, and every function of H with the same slope there moves them "
     "so: add runs that start at other values of H"
@@ -189,7 +187,7 @@ def on_one_level(
     """Return whether H (N,) is one value but for its noise (N,), beside what slopes (N, n) make
     along the spread (n,) of each coordinate: every f(H) of the same slope there moves alike."""
     across = np.mean(np.sum((slopes * spread) ** 2, axis=-1))
-    return bool(np.var(h) - np.mean(by_noise**2) <= OPTIONS.level * across)
+    return bool(np.var(h) - np.mean(by_noise**2) <= Options.level * across)
 
 
 def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +209,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
     n, more = len(names), train.beside.names
     field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress)
     degree = _degree(field, n)
-    if error > OPTIONS.printed and more:
+    if error > Options.printed and more:
         raise FitError(
             f"the field of degree {degree} with {', '.join(more)} leaves {error:.1e} of the "
             "spread, which is misfit or noise; only pairs without noise tell how a law with a "
@@ -219,7 +217,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
             "bracket: gfnn.fit(pairs, bracket=…, terms=[…])",
             f"no law: the field with {', '.join(more)} leaves {error:.1e} of the spread",
         )
-    if error > OPTIONS.exact and terms is None and not more:
+    if error > Options.exact and terms is None and not more:
         sigma = _noise_of(train, fit)
         law = _of_populations(train, held, names, sigma, error)
         if law is not None:
@@ -228,9 +226,9 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         if hidden:
             raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
     noisy = None if more else _noise(field, fit, error, train)
-    free = terms is None and not more and error > OPTIONS.exact and not np.ndim(train.dt)
-    free = free and _several_steps(field, fit, train) >= OPTIONS.fewest
-    while free and noisy is None and degree < OPTIONS.degrees[-1]:
+    free = terms is None and not more and error > Options.exact and not np.ndim(train.dt)
+    free = free and _several_steps(field, fit, train) >= Options.fewest
+    while free and noisy is None and degree < Options.degrees[-1]:
         try:  # terms that one step does not show
             higher = _free_field(train, held, names, None, on_progress, degree + 1)
         except FitError:
@@ -238,14 +236,14 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         degree, noisy = _degree(higher[0], n), _noise(*higher[:3], train)
         field, fit, error, notes, _ = higher if noisy else (field, fit, error, notes, None)
     fit = fit if noisy is None else noisy.fit
-    if noisy is None and error > OPTIONS.exact and terms is None and not more:
+    if noisy is None and error > Options.exact and terms is None and not more:
         law = _without_polynomials(train, held, names, on_progress)
         if law is not None:
             return law._replace(notes=notes)
-    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    some = train.z0[:: max(1, len(train.z0) // Options.states)]
     f, slope = _at(field, fit.c, some, n)
-    rng = np.random.default_rng(OPTIONS.seed)
-    drawn = [rng.normal(size=len(fit.root)) @ fit.root for _ in range(OPTIONS.draws)]
+    rng = np.random.default_rng(Options.seed)
+    drawn = [rng.normal(size=len(fit.root)) @ fit.root for _ in range(Options.draws)]
     draws = [_at(field, c, some, n) for c in drawn]
     off = [np.mean((one[0] / sizes(f)) ** 2) for one in draws]
     unsure = float(np.sqrt(np.mean(off)))
@@ -262,14 +260,14 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         if not len(null.vectors) or (null.rate and kind == LOG):
             continue
         library = library_of(kind, names, degree, terms, factors)
-        for found in brackets_of(null, some, f, library, OPTIONS.errors * unsure):
+        for found in brackets_of(null, some, f, library, Options.errors * unsure):
             missed.append(found.name)
             try:
                 law = _through_flow(found, train, held, notes, noisy)
             except FitError:
                 continue
             law = law if noisy is None else _richer(law, noisy, train, held)
-            close = law.error <= max(OPTIONS.worse * error, OPTIONS.exact)
+            close = law.error <= max(Options.worse * error, Options.exact)
             if close and (noisy is None or _leaves_noise(law, noisy.sigma, train, held)):
                 return law
     if missed:
@@ -321,13 +319,13 @@ def _free_field(train, held, names, terms, on_progress, least: int = 1):
         field = FreeField(Partials.of(terms, train.z0))
         fit = fit_field(field, *train[:3])
         best = field, fit, error_on(field, fit.c, held)
-        if best[2] <= OPTIONS.exact:
+        if best[2] <= Options.exact:
             return (*best, (), None)
     kept = None
-    degrees = [degree for degree in OPTIONS.degrees if degree >= least]
+    degrees = [degree for degree in Options.degrees if degree >= least]
     for degree, factors in product(degrees, tuple(train.beside.factors(names))):
         library = polynomials(names, degree, constant=True, factors=factors)
-        if library.num_parameters * OPTIONS.rows_per_term > len(train.z0):
+        if library.num_parameters * Options.rows_per_term > len(train.z0):
             continue
         field, missing = FreeField(library), ()
         relations = undetermined(field, train.z0, 0.0)
@@ -335,7 +333,7 @@ def _free_field(train, held, names, terms, on_progress, least: int = 1):
             field = FreeField(library.take(range(1, library.num_parameters)))
             missing = undetermined(field, train.z0, 0.0)
         if len(missing):
-            if best is not None and best[2] <= OPTIONS.partly:
+            if best is not None and best[2] <= Options.partly:
                 break
             functions = _independent(library, relations, train.z0)
             raise _too_few_runs(functions, degree, len(np.unique(train.run)))
@@ -345,10 +343,10 @@ def _free_field(train, held, names, terms, on_progress, least: int = 1):
         except FitError:
             continue
         error = error_on(field, fit.c, held)
-        if best is None or error <= OPTIONS.better * best[2]:
+        if best is None or error <= Options.better * best[2]:
             best, kept = (field, fit, error), factors
             notes = (_SHELL.format(count=len(relations)),) if len(relations) else ()
-        if error <= OPTIONS.exact:
+        if error <= Options.exact:
             break
     if best is None:
         raise FitError(
@@ -383,7 +381,7 @@ def _hidden_relations(train: Data, names: tuple[str, ...], sigma: np.ndarray) ->
     found = Spectrum.of(values, values[:, 0], 0.0, 0.0)
     slopes = np.einsum("njk,mk->nmj", library.term_gradients(train.z0), found.vt / found.column)
     by_noise = np.sqrt(np.sum((slopes * sigma) ** 2, axis=(0, 2)))
-    return int(np.sum(found.s <= OPTIONS.hidden * by_noise))
+    return int(np.sum(found.s <= Options.hidden * by_noise))
 
 
 def _of_populations(train: Data, held: Data, names, sigma, error: float) -> PoissonLaw | None:
@@ -430,7 +428,7 @@ def _of_populations(train: Data, held: Data, names, sigma, error: float) -> Pois
         left = law.noise_of(train.z0)
         part = float(np.mean(np.sqrt(np.mean(left**2, axis=0)) / train.spread))
         law = law._replace(fit=law.fit._replace(residual=left, relative=part))
-        close = law.error <= min(OPTIONS.solved, OPTIONS.worse * error)
+        close = law.error <= min(Options.solved, Options.worse * error)
         if close or _leaves_noise(law, sigma, train, held):
             return law
     return None
@@ -440,7 +438,7 @@ def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -
     """Return whether a law leaves no more than the noise (n,) of the states, and has the same H in
     all parts of a run, to the errors of its coefficients, with what its friction took added. Arcs
     tell no drift of H: each has an H of its own."""
-    if law.sigma is None or (law.sigma > OPTIONS.grown * sigma).any():
+    if law.sigma is None or (law.sigma > Options.grown * sigma).any():
         return False
     z, run, place = (
         np.concatenate([getattr(data, key) for data in (train, held)])
@@ -451,10 +449,10 @@ def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -
         order = np.argsort(place[own])
         states, breaks = z[own][order], np.flatnonzero(np.diff(place[own][order]) != 1) + 1
         for stretch in np.split(states, breaks) if damped else (states,):
-            if len(stretch) < 2 * OPTIONS.parts * damped:
+            if len(stretch) < 2 * Options.parts * damped:
                 continue
             _, errors = _energies(law, stretch)
-            parts = np.array_split(np.arange(len(stretch)), min(OPTIONS.parts, len(stretch)))
+            parts = np.array_split(np.arange(len(stretch)), min(Options.parts, len(stretch)))
             weights = [errors[part] ** -2.0 for part in parts]
             terms, kept = _kept(law, stretch, train.dt)
             means = np.array(
@@ -466,7 +464,7 @@ def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -
             h, one = np.linalg.solve(np.linalg.cholesky(covariance), both).T
             total += h @ h - (h @ one) ** 2 / (one @ one)
             count += len(parts) - 1
-    return total <= OPTIONS.uneven * max(count, 1)
+    return total <= Options.uneven * max(count, 1)
 
 
 def _kept(law: PoissonLaw, z: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -499,10 +497,10 @@ def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
 
 def _independent(library: Terms, relations: np.ndarray, z: np.ndarray) -> int:
     """Number of independent functions among relations (m, K) of the library at states z (N, n)."""
-    some = z[:: max(1, len(z) // OPTIONS.states)]
+    some = z[:: max(1, len(z) // Options.states)]
     slopes = library.term_gradients(some) @ relations.T * sizes(z)[:, None]
     slopes = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
-    ranks = np.linalg.matrix_rank(slopes, tol=OPTIONS.dependent)
+    ranks = np.linalg.matrix_rank(slopes, tol=Options.dependent)
     return int(np.median(ranks))
 
 
@@ -519,18 +517,18 @@ class _Noisy(NamedTuple):
 def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy | None:
     """Noise of sequences: residuals that do not grow with the time between states.
     None of pairs without noise, of single pairs, and where the field itself misses."""
-    if error <= OPTIONS.exact or np.ndim(train.dt):
+    if error <= Options.exact or np.ndim(train.dt):
         return None
     sequences = arcs_of(train.z0, train.z1, train.run, train.place)
     steps = _several_steps(field, fit, train)
-    sequences = [s for s in sequences if len(s) >= OPTIONS.fewest]
+    sequences = [s for s in sequences if len(s) >= Options.fewest]
     steps = min(steps, max(map(len, sequences), default=4) // 2)
     if not sequences:
         return None
     z0, z1 = lagged(sequences, steps)
     long = z0, z1, steps * train.dt
     again = fit_field(field, *long, fit.c)
-    if again.relative > OPTIONS.grown * fit.relative:
+    if again.relative > Options.grown * fit.relative:
         return None
     sigma = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
     return _Noisy(sequences, long, again, sigma)
@@ -538,9 +536,9 @@ def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy
 
 def _several_steps(field: FreeField, fit: FieldFit, train: Data) -> int:
     """Number of steps over which the field is fitted to states with noise."""
-    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    some = train.z0[:: max(1, len(train.z0) // Options.states)]
     rates = np.abs(field.jacobian(fit.c, some)).sum(axis=2).max(axis=1) * train.dt
-    return max(2, int(OPTIONS.long / np.median(rates)))
+    return max(2, int(Options.long / np.median(rates)))
 
 
 def _richer(law: PoissonLaw, noisy: _Noisy, train: Data, held: Data) -> PoissonLaw:
@@ -550,7 +548,7 @@ def _richer(law: PoissonLaw, noisy: _Noisy, train: Data, held: Data) -> PoissonL
     bracket, own = law.bracket, law.field.library
     degree = max(map(sum, own.powers))
     library = library_of(_kind_of(bracket), bracket.labels, degree + 1, None)
-    if bracket.casimirs or library.num_parameters > OPTIONS.most_terms:
+    if bracket.casimirs or library.num_parameters > Options.most_terms:
         return law
     places = dict(zip(library.term_names, range(library.num_parameters), strict=True))
     if not set(own.term_names) <= set(places):
@@ -616,19 +614,19 @@ def _of_bracket(bracket, train, held, terms, on_progress) -> PoissonLaw:
     """H of a known bracket: polynomials of the smallest degree that a higher one does not beat, or,
     where none is exact, shapes of single coordinates beside the quadratic terms."""
     best = None
-    sizes_of_h = product(OPTIONS.given_degrees, tuple(train.beside.factors(bracket.labels)))
+    sizes_of_h = product(Options.given_degrees, tuple(train.beside.factors(bracket.labels)))
     for degree, factors in sizes_of_h if terms is None else ((1, None),):
         library = library_of(_kind_of(bracket), bracket.labels, degree, terms, factors)
-        if library.num_parameters * OPTIONS.rows_per_term > train.z0.size:
+        if library.num_parameters * Options.rows_per_term > train.z0.size:
             continue
         on_progress(f"H of {library.num_parameters} terms")
         try:
             law = _of_library(bracket, library, train, held)
         except FitError:
             continue
-        if best is None or law.error <= OPTIONS.better * best.error:
+        if best is None or law.error <= Options.better * best.error:
             best = law
-        if law.error <= OPTIONS.exact:
+        if law.error <= Options.exact:
             return law
     if best is None:
         raise FitError(f"no H of the library has a flow near these {len(train.z0)} pairs")
@@ -649,7 +647,7 @@ def _of_library(bracket: Bracket, library: Terms, train: Data, held: Data) -> Po
 
 def _lean(bracket, library, c, train: Data, held: Data) -> PoissonLaw:
     """The law of coefficients c, of all that differ by Casimirs the one of fewest terms."""
-    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    some = train.z0[:: max(1, len(train.z0) // Options.states)]
     field = PoissonField(bracket, library)
     own = hamiltonian_of(field, some, field.rate(c, some))
     kept = np.flatnonzero(own.c).tolist()
@@ -679,10 +677,10 @@ def _without_polynomials(train, held, names, on_progress) -> PoissonLaw | None:
         base = library_of(_kind_of(bracket), names, 2, None)
         with contextlib.suppress(FitError):
             tried.append((_of_library(bracket, base, train, held).error, bracket))
-    for _, bracket in sorted(tried, key=lambda one: one[0])[: OPTIONS.standard]:
+    for _, bracket in sorted(tried, key=lambda one: one[0])[: Options.standard]:
         on_progress(f"{bracket.name}: an H that is no polynomial")
         law = _of_shapes(bracket, train, held, on_progress)
-        if law is not None and law.error <= OPTIONS.exact:
+        if law is not None and law.error <= Options.exact:
             library = law.field.library
             turned, c = upright(bracket, library, law.fit.c, train.z0)
             return law._replace(field=PoissonField(turned, library), fit=law.fit._replace(c=c))

@@ -107,7 +107,6 @@ def _of_arcs(sigma: np.ndarray, arcs) -> np.ndarray:
     return sigma if sigma.ndim == 1 else sigma[arcs]
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the fit to readings of two monitors (benchmarks/storage_ring.py)."""
 
@@ -118,9 +117,6 @@ class Options:
     solved: float = 1e-10  # a step in NumPy whose residual is larger has not been solved
     largest: int = 10  # degree of S
     worse: int = 2  # sizes in a row that are no better end the search
-
-
-OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,16 +168,16 @@ def latent_readings(
         return None
     best, worse = None, 0
     for family in _families(piece.family):
-        if best and OPTIONS.passes * arcs.size * family.num_parameters**2 > OPTIONS.most_operations:
+        if best and Options.passes * arcs.size * family.num_parameters**2 > Options.most_operations:
             break
         found = _fitted(piece, family, ends, arcs)
         if found.converged and (best is None or found.criterion < best.criterion):
             best, worse = found, 0
         else:
             worse += 1
-        if worse == OPTIONS.worse:
+        if worse == Options.worse:
             break
-    if worse < OPTIONS.worse:  # larger sizes leave less and less: that is no noise
+    if worse < Options.worse:  # larger sizes leave less and less: that is no noise
         return None
     return best and dataclasses.replace(best, piece=_with_predictor(best.piece, ends, arcs))
 
@@ -189,7 +185,7 @@ def latent_readings(
 def _families(family: Any) -> Iterator[Any]:
     """Families by rising degree; none where S has no degree."""
     if isinstance(family, Products):
-        yield from (dataclasses.replace(family, degree=n) for n in range(2, OPTIONS.largest + 1))
+        yield from (dataclasses.replace(family, degree=n) for n in range(2, Options.largest + 1))
 
 
 def _fitted(
@@ -235,7 +231,7 @@ def _with_predictor(piece: Generated, ends, arcs) -> Generated:
     """The piece with a predictor of its own images of the states that were read."""
     z0, z1 = _ends_of_steps(ends, arcs)[1]
     images, error = piece.refined_step(z0, piece.chart.evaluation_point(z0, z1))
-    solved = (error < OPTIONS.solved) & np.isfinite(images).all(axis=1)
+    solved = (error < Options.solved) & np.isfinite(images).all(axis=1)
     fitted = fit_predictors(piece.chart, z0[solved], images[solved], piece.dt)
     return dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
 
@@ -255,7 +251,7 @@ def _arcs(turns: list[np.ndarray]) -> np.ndarray | None:
     """Arcs (A, L, 2d) of one length; of very many every so many."""
     longest = max((len(y) for y in turns), default=0)
     length = min(longest, LONGEST + 1)
-    if length < OPTIONS.fewest:
+    if length < Options.fewest:
         return None
     cut = [y[i : i + length] for y in turns for i in range(0, len(y) - length + 1, length)]
-    return np.array(cut[:: -(-len(cut) * length // OPTIONS.most_nodes)])
+    return np.array(cut[:: -(-len(cut) * length // Options.most_nodes)])

@@ -41,7 +41,6 @@ from gfnn_jax.models.parameters import states_and_functions, walked
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the search for S as a sum of terms (benchmarks/args.py)."""
 
@@ -54,8 +53,6 @@ class Options:
     flat: float = 1.2  # libraries whose errors differ by less have met the pairs' noise
     solved: float = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
-
-OPTIONS = Options()
 
 _FEWER_TERMS = "removing terms of S that are not significant"
 
@@ -145,11 +142,11 @@ class SumOfTerms:
                 f"{' for all values of the parameters' if data.args is not None else ''}. Add "
                 "pairs, or take a smaller dt"
             )
-        chart, limit = best.piece.chart, OPTIONS.flat * best.error.relative
+        chart, limit = best.piece.chart, Options.flat * best.error.relative
         rivals = [f for f in tried if f.piece.chart is chart and f.error.relative <= limit]
         stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
         unit = budget.unit(
-            _FEWER_TERMS, ROWS, len(OPTIONS.thresholds) * _work(best.piece.family, data)
+            _FEWER_TERMS, ROWS, len(Options.thresholds) * _work(best.piece.family, data)
         )
         full = best
         sparse = within(unit, lambda: _sparse(full, data, tolerance, noisy=stalled))
@@ -186,7 +183,7 @@ class SumOfTerms:
             attempt,
             lambda tried: tried.error.bound,
             bound=tolerance.bound,
-            most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, OPTIONS.most_terms),
+            most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, Options.most_terms),
         )
 
 
@@ -198,7 +195,7 @@ def _work(family: Any, data: Dataset) -> float:
 
 def _fewer(data: Dataset) -> Dataset:
     """Take as many training pairs as the terms of a site need."""
-    most = max(1, OPTIONS.structured_rows // data.y0.shape[1])
+    most = max(1, Options.structured_rows // data.y0.shape[1])
     return data.trained_on(data.training[:most])
 
 
@@ -206,8 +203,8 @@ def _of_sites(data: Dataset, tolerance: Tolerance, attempt) -> Iterator[_Tried]:
     """The libraries of a structure by rising size, until one meets the tolerance."""
     assert data.structure is not None
     width = data.y0.shape[1]
-    rows = data.training[: max(1, OPTIONS.null_rows // width)]
-    most = min(len(data.training) * width / ROWS_PER_TERM, OPTIONS.most_terms)
+    rows = data.training[: max(1, Options.null_rows // width)]
+    most = min(len(data.training) * width / ROWS_PER_TERM, Options.most_terms)
     for library in data.structure.libraries(data.dim):
         family = library.take(null_terms(library, data.y0[rows])[0])
         if family.num_parameters <= most:
@@ -240,7 +237,7 @@ def _validated(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
     if not matrix_free(family):
         determinant = piece.determinant(data.y0[rows], data.y1[rows], args)
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
-    images = data.users_image(images, (off < OPTIONS.solved) & (not folds), rows)
+    images = data.users_image(images, (off < Options.solved) & (not folds), rows)
     error = measured_error(data, tolerance, images)
     w, target, args, weight = _data(piece.chart, family, data, data.training)
     left = (family.gradient(params, w, args) - target) * weight
@@ -256,7 +253,7 @@ def _covariance_root(piece: Generated, data: Dataset) -> np.ndarray:
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
     found = _larger(family, data)
     if found is not None and ROWS_PER_TERM * found.num_parameters <= target.size:
-        some = slice(max(1, OPTIONS.null_rows // w.shape[1]))
+        some = slice(max(1, Options.null_rows // w.shape[1]))
         given = () if args is None else (args,)
         few = null_terms(found, w[some], args=None if args is None else args[some])[0]
         known = found.take(few)
@@ -291,7 +288,7 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
     residual = terms @ piece.params - (target * weight).ravel()
     triangle = Triangle.of(np.column_stack([terms, residual]))
     c = np.asarray(piece.params)
-    sets = at_thresholds(triangle, c, OPTIONS.thresholds)
+    sets = at_thresholds(triangle, c, Options.thresholds)
     if noisy:
         few = terms_above_noise(triangle, c, ABOVE_NOISE)[0].tolist()
         sets = [few] if 0 < len(few) < len(c) else []

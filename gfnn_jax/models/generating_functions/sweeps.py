@@ -94,7 +94,6 @@ class Generates:
         return self.solve(size)[1]
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Sizes of the sweeps, and what bounds them (benchmarks/constants.py)."""
 
@@ -122,7 +121,6 @@ class Options:
     worth_keeping: float = 1.0  # seconds
 
 
-OPTIONS = Options()
 # Rows per term of a larger size, by which noise is told from misfit.
 SAMPLE_ROWS = 6
 
@@ -239,12 +237,12 @@ class LinearSweep(Generates):
             if own is not None:
                 return ([family] for family in own(inputs))
             if kind == "sines":
-                return ([Sines(inputs, count)] for count in OPTIONS.sines)
-            products = ((Products(inputs, n, signs) for n in g) for g in OPTIONS.degrees)
+                return ([Sines(inputs, count)] for count in Options.sines)
+            products = ((Products(inputs, n, signs) for n in g) for g in Options.degrees)
             return products if data.own_dt is None else (map(OfTimeStep, g) for g in products)
 
         counted = kind == "sines" or own is not None
-        known = len(OPTIONS.sines) if counted else sum(map(len, OPTIONS.degrees))
+        known = len(Options.sines) if counted else sum(map(len, Options.degrees))
         # Test rows determine a size too: once they have stated its error, it is fitted to them.
         rows = self._train[1].size + len(data.test) * self._width
         self._groups, self._determining = groups, rows
@@ -254,7 +252,7 @@ class LinearSweep(Generates):
             for family in group
         ]
         # Else the last size is the largest there is, or the most terms are reached.
-        self.short_of_pairs = len(self.sizes) < known and rows < ROWS_PER_TERM * OPTIONS.most_terms
+        self.short_of_pairs = len(self.sizes) < known and rows < ROWS_PER_TERM * Options.most_terms
         self._factors: dict[Any, Factors] = {}
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
@@ -336,8 +334,8 @@ class LinearSweep(Generates):
         share = fitted / (fitted + len(self.data.validation))
         pairs = int(np.ceil(ROWS_PER_TERM * terms / self._width / share))
         most = (
-            f", more than the {OPTIONS.most_terms:,} that are tried"
-            if terms > OPTIONS.most_terms
+            f", more than the {Options.most_terms:,} that are tried"
+            if terms > Options.most_terms
             else ""
         )
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
@@ -408,7 +406,7 @@ class LinearSweep(Generates):
         them are a sample, where all would take too long."""
         count, width = self._train[1].shape
         return min(
-            count, max(1, int(OPTIONS.most_operations / (group.num_parameters**2 * width)))
+            count, max(1, int(Options.most_operations / (group.num_parameters**2 * width)))
         ), width
 
     def _larger(self, size: Size) -> Size | None:
@@ -456,7 +454,7 @@ class LinearSweep(Generates):
                 self._held,
             )
         )
-        if self._kept is not None and time.perf_counter() - started > OPTIONS.worth_keeping:
+        if self._kept is not None and time.perf_counter() - started > Options.worth_keeping:
             parts = {"inner": inner, "outer": outer, "held": held}
             rows = {f"{name}_rows": part.rows for name, part in parts.items()}
             factors = {name: part.factor for name, part in parts.items()}
@@ -500,7 +498,7 @@ class LinearSweep(Generates):
     def error_by_noise(self, size: Size) -> float:
         """Error of the size's ∇S by noise, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
-        half = self.data.training // OPTIONS.halves_block % 2
+        half = self.data.training // Options.halves_block % 2
         train, held = self.factors(size.group)[:2]
         count = size.family.num_parameters
         one, other = (
@@ -521,7 +519,7 @@ class LinearSweep(Generates):
         """(2d,) standard deviation of the noise of each of the user's coordinates, from what this
         size leaves of a sample of the training pairs."""
         data = self.data
-        places, goes_on = looked_at(data.pairs, data.training, OPTIONS.noise_pairs)
+        places, goes_on = looked_at(data.pairs, data.training, Options.noise_pairs)
         w, target, *args = (a[places] for a in self._train)
         solved, params = self.solve(size)
         slopes = self._slopes(size.family, w, *args)
@@ -656,7 +654,7 @@ def trial_residual(data: Dataset) -> float:
     if not np.isfinite(w + target).all():
         return float("inf")
     inputs = inputs_of(data, w)
-    trials = ([Products(inputs, degree)] for degree in OPTIONS.trial)
+    trials = ([Products(inputs, degree)] for degree in Options.trial)
     groups = list(_determined(trials, w.size // 2, ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)
     train, held = (
@@ -673,7 +671,7 @@ def _determined(groups: Iterable[Iterable[Any]], rows: int, each: float) -> Iter
     Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
     terms of a high degree could not even be counted.
     """
-    most = min(OPTIONS.most_terms, int(rows / each))
+    most = min(Options.most_terms, int(rows / each))
     for group in groups:
         kept = []
         for family in group:

@@ -44,7 +44,6 @@ from gfnn_jax.models.hamiltonians.sequences import (
     triangle_of,
 )
 from gfnn_jax.models.hamiltonians.symmetries import LawNumbers, restricted
-from gfnn_jax.models.textbook.noisy_search import OPTIONS as NOISY
 from gfnn_jax.models.textbook.noisy_search import (
     Formula,
     NoisyTextbook,
@@ -52,8 +51,9 @@ from gfnn_jax.models.textbook.noisy_search import (
     gradients_of_pairs,
     weak_gradients,
 )
-from gfnn_jax.models.textbook.search import OPTIONS as CLEAN
+from gfnn_jax.models.textbook.noisy_search import Options as Noisy
 from gfnn_jax.models.textbook.search import Law, Textbook
+from gfnn_jax.models.textbook.search import Options as Clean
 from gfnn_jax.solve.latent_arcs import Fitted
 from gfnn_jax.solve.linear import covariance_root
 from gfnn_jax.solve.noise import robust
@@ -109,7 +109,7 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
     coordinates and angles. ``partly`` is called with the three laws that come closest, where none
     is exact."""
     data, rows, work = problem.data, problem.data.training, problem.work
-    if not problem.simple or data.dim > CLEAN.most_dim or len(rows) < OPTIONS.fewest:
+    if not problem.simple or data.dim > Clean.most_dim or len(rows) < OPTIONS.fewest:
         return None
     allowance = dataclasses.replace(problem.flows.allowance, cap=None)
     own = dataclasses.replace(problem.flows, allowance=allowance)  # no part of what libraries take
@@ -383,7 +383,7 @@ def _significant(
     length = float(
         np.sum(free * np.log(noise_of(found)))
         + 0.5 * np.log(free.sum()) * len(found.p)
-        + NOISY.penalty * formula.complexity
+        + Noisy.penalty * formula.complexity
     )
     return _LawOfSequences(formula, found, length)
 

@@ -262,8 +262,8 @@ def followed(
     masses = np.einsum("ki,nij,kj->nk", directions, by_p, directions).max(axis=0)
     rates = np.abs(rho) * masses * dt  # of a change of speed over a step
     creeping = noise * np.abs(directions) @ data.scale[: data.dim] / dt
-    widths = np.maximum(creeping, rates / (laws.OPTIONS.stiffest * MOST_SUBSTEPS))
-    substeps = int(np.ceil(np.max(rates[dry] / widths[dry]) / laws.OPTIONS.stiffest))
+    widths = np.maximum(creeping, rates / (laws.Options.stiffest * MOST_SUBSTEPS))
+    substeps = int(np.ceil(np.max(rates[dry] / widths[dry]) / laws.Options.stiffest))
     wide = dataclasses.replace(friction, widths=np.where(dry, widths, friction.widths))
     return _replaced(family, wide), max(substeps, 1), tuple(map(float, widths[dry]))
 

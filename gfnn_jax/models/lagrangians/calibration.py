@@ -35,8 +35,7 @@ from gfnn_jax.maps.estimates import (
 from gfnn_jax.maps.sensors import TUBE, Sensors
 
 
-@dataclasses.dataclass(frozen=True)
-class CalibrationOptions:
+class Options:
     """Options of the calibration of forecasts (`benchmarks/measured.py`, `bands.py`).
 
     windows, tried: starts of forecasts, and those that choose the window. choices: periods from
@@ -63,9 +62,6 @@ class CalibrationOptions:
     inside: float = 0.95
     parts: int = 8
     fractions: tuple[float, ...] = (0.01, 0.05, 0.20)
-
-
-OPTIONS = CalibrationOptions()
 
 
 class Horizon(NamedTuple):
@@ -129,10 +125,10 @@ def calibrated(
     if not starts or not np.all(spread > 0):  # of events
         return _unknown(law, spread)
     shortest = law.sensors.observation_model.shortest
-    short = max((OPTIONS.short - 1) * scales.dt, shortest)
+    short = max((Options.short - 1) * scales.dt, shortest)
     period = max(scales.period, shortest)
-    tried = np.unique(np.maximum(np.array(OPTIONS.choices) * period, short))
-    some = starts[:: -(-len(starts) // OPTIONS.tried)]
+    tried = np.unique(np.maximum(np.array(Options.choices) * period, short))
+    some = starts[:: -(-len(starts) // Options.tried)]
     longest = max(s.t[-1] - s.t[0] for s in found)
     reach = scales.period if scales.period < longest else longest / 2
     leads = np.array([0.5, 1.0]) * reach
@@ -144,16 +140,16 @@ def calibrated(
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
     best = float(tried[np.argmin(middle)])
     if law.sensors.level:  # which a longer window determines better
-        best = float(tried[middle <= (1 + OPTIONS.alike) * np.min(middle)][-1])
+        best = float(tried[middle <= (1 + Options.alike) * np.min(middle)][-1])
     leads = np.geomspace(
-        max(OPTIONS.first * scales.period, scales.dt), OPTIONS.last * scales.period, OPTIONS.leads
+        max(Options.first * scales.period, scales.dt), Options.last * scales.period, Options.leads
     )
     leads = leads[leads <= 0.9 * longest]
     windows = np.where(np.arange(len(starts)) % 2, short, best)
     own, orbits, x, times = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(own), _shared(orbits.std)
     sensors, known, unit = _with_shape(law.sensors, x, errors, deviations)
-    enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= OPTIONS.fewest
+    enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= Options.fewest
     leads, errors, known, unit = (
         leads[enough],
         *(values[:, enough] for values in (errors, known, unit)),
@@ -161,17 +157,17 @@ def calibrated(
     own, orbits = own[:, enough], orbits._replace(modes=orbits.modes[:, enough])
     if not len(leads):
         return _unknown(law, spread)
-    part = np.arange(len(starts)) * OPTIONS.parts // len(starts)
+    part = np.arange(len(starts)) * Options.parts // len(starts)
     every = np.tile(part, len(errors) // len(part))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # times of one part alone
         missed = (errors**2 / 4 - known) / unit
         misfit, *others = (
-            np.sqrt(np.maximum(np.nanquantile(missed[every != k], OPTIONS.inside, axis=0), 0.0))
-            for k in range(-1, OPTIONS.parts)
+            np.sqrt(np.maximum(np.nanquantile(missed[every != k], Options.inside, axis=0), 0.0))
+            for k in range(-1, Options.parts)
         )
         sizes = np.abs(errors) / spread
-        median, *parts = (np.nanmedian(sizes[every != k], axis=0) for k in range(-1, OPTIONS.parts))
+        median, *parts = (np.nanmedian(sizes[every != k], axis=0) for k in range(-1, Options.parts))
     unseen = np.where(np.isfinite(others), others, misfit)[part]  # by a part's own scores
     sensors = dataclasses.replace(
         sensors,
@@ -184,11 +180,11 @@ def calibrated(
         observed=float(sum(s.t[-1] - s.t[0] for s in found)),
     )
     bands = np.where(np.isfinite(errors), 2 * np.sqrt(known + misfit**2 * unit), np.nan)
-    measured = np.max(np.nanquantile(np.abs(errors), OPTIONS.inside, axis=0) / spread, axis=1)
+    measured = np.max(np.nanquantile(np.abs(errors), Options.inside, axis=0) / spread, axis=1)
     predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
     horizons = [
         Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f))
-        for f in OPTIONS.fractions
+        for f in Options.fractions
     ]
     return Calibration(law._replace(sensors=sensors), horizons, median, np.stack(parts))
 
@@ -199,10 +195,10 @@ def level_of_friction(thirds: Thirds, found: Sequence[Stretch], scales: Scales) 
     starts = _starts(found, scales)
     if not starts or not thirds.laws[0].form.friction.count:
         return 0.0
-    starts = starts[:: -(-len(starts) // OPTIONS.tried)]
+    starts = starts[:: -(-len(starts) // Options.tried)]
     cut = [_window(found[i], k, scales.period) for i, k in starts]
     third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
-    x, covariance = estimates_of(thirds.with_level(OPTIONS.widest).laws, third, cut)
+    x, covariance = estimates_of(thirds.with_level(Options.widest).laws, third, cut)
     d = 2 * thirds.laws[0].form.dim
     excess = x[:, d] ** 2 - covariance[:, d, d]
     return float(np.sqrt(max(0.0, np.median(excess))))
@@ -249,8 +245,8 @@ def _scores(errors: np.ndarray, orbits: Orbits, times: np.ndarray) -> np.ndarray
 
 def _shared(values: np.ndarray) -> np.ndarray:
     """Values (B, n, k) together with those of near leads (B (2 near + 1), n, k)."""
-    far = np.pad(values, ((0, 0), (OPTIONS.near, OPTIONS.near), (0, 0)), constant_values=np.nan)
-    return np.concatenate([far[:, k : k + values.shape[1]] for k in range(2 * OPTIONS.near + 1)])
+    far = np.pad(values, ((0, 0), (Options.near, Options.near), (0, 0)), constant_values=np.nan)
+    return np.concatenate([far[:, k : k + values.shape[1]] for k in range(2 * Options.near + 1)])
 
 
 def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
@@ -264,16 +260,16 @@ def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
 
 def _window(s: Stretch, last: int, seconds: float) -> Window:
     """The samples of so many seconds up to the last, and of ``short`` at least."""
-    first = min(int(np.searchsorted(s.t, s.t[last] - seconds)), max(0, last - OPTIONS.short + 1))
+    first = min(int(np.searchsorted(s.t, s.t[last] - seconds)), max(0, last - Options.short + 1))
     own = slice(first, last + 1)
     return thinned(Window(s.t[own], s.y[own], s.t, s.u, s.noise[own], s.args))
 
 
 def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
     """(stretch, sample) of the last samples of windows, evenly over the record."""
-    fewest = max(OPTIONS.short, round(0.25 * scales.period / scales.dt))
+    fewest = max(Options.short, round(0.25 * scales.period / scales.dt))
     places = [(i, k) for i, s in enumerate(found) for k in range(fewest - 1, len(s.t) - 1)]
-    every = max(1, len(places) // OPTIONS.windows)
+    every = max(1, len(places) // Options.windows)
     return places[::every] if places else []
 
 

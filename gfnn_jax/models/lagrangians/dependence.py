@@ -48,8 +48,7 @@ from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 from gfnn_jax.models.parameters import keeps_away
 
 
-@dataclasses.dataclass(frozen=True)
-class DependenceOptions:
+class Options:
     """Limits of the functions of parameters that are tried (`benchmarks/parameters.py`).
 
     largest, total: powers of one parameter, and of all of them: of the lengths of a double pendulum
@@ -63,8 +62,6 @@ class DependenceOptions:
     steps: int = 8
     most: int = 30
 
-
-OPTIONS = DependenceOptions()
 
 Function = tuple[int, ...]  # whole powers of the parameters
 Sets = tuple[tuple[Function, ...], ...]  # the functions of each coefficient
@@ -197,15 +194,15 @@ def _inertia(structure: Structure, gauge: np.ndarray) -> np.ndarray:
 def functions_tried(args: np.ndarray) -> list[Function]:
     """Powers of parameters args (n, k), the plainest first: negative ones where a parameter keeps
     away from 0."""
-    most = OPTIONS.largest
+    most = Options.largest
     ranges = [range(-most if keeps_away(a) else 0, most + 1) for a in args.T]
-    found = [powers for powers in product(*ranges) if sum(map(abs, powers)) <= OPTIONS.total]
+    found = [powers for powers in product(*ranges) if sum(map(abs, powers)) <= Options.total]
     return sorted(found, key=_size_of)
 
 
 def _size_of(function: Function) -> float:
     """The size of the powers: that of the plainest function is 0."""
-    return sum(abs(n) + OPTIONS.below * (n < 0) for n in function)
+    return sum(abs(n) + Options.below * (n < 0) for n in function)
 
 
 def seen(fit: LawFit, args: np.ndarray) -> GroupEstimate:
@@ -282,7 +279,7 @@ class _Problem:
         R = np.stack([one.triangle for one in self.values])
         p = np.stack([one.p for one in self.values])
         cost, best = np.inf, x
-        for _ in range(OPTIONS.steps):
+        for _ in range(Options.steps):
             with np.errstate(all="ignore"):  # of no inertia in some run
                 shares = np.where(scaled, 1 / (by_inertia @ x)[:, None], 1.0)
                 own = (turn @ x) * shares
@@ -313,7 +310,7 @@ class _Problem:
         """The sets of the lowest score that single changes lead to, M₁₁ with these functions."""
         none = self.every[0]
         here = self.solved((first, *((none,),) * (self.count - 1)))
-        for _ in range(OPTIONS.most):
+        for _ in range(Options.most):
             best = min(
                 map(self.solved, self._changed(here.sets)),
                 key=lambda one: one.score,

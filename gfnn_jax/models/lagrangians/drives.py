@@ -23,14 +23,13 @@ from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import correction
 from gfnn_jax.models.lagrangians.structure import Structure
-from gfnn_jax.models.lagrangians.weak_form import OPTIONS as WEAK
+from gfnn_jax.models.lagrangians.weak_form import Options as Weak
 from gfnn_jax.models.lagrangians.weak_form import weak_rows
-from gfnn_jax.models.lagrangians.windows import OPTIONS as WINDOWS
+from gfnn_jax.models.lagrangians.windows import Options as OfWindows
 from gfnn_jax.models.lagrangians.windows import Windows
 
 
-@dataclasses.dataclass(frozen=True)
-class DriveOptions:
+class Options:
     """Options of the search for a drive (`benchmarks/vocabulary.py`).
 
     spacing: of the frequencies tried, in turns over the record, and lows: of them, that are looked
@@ -60,32 +59,29 @@ class DriveOptions:
     noise: float = 3.0
 
 
-OPTIONS = DriveOptions()
-
-
 def hidden_frequency(problem: ArcProblem, stiff: bool, known: Sequence[float] = ()) -> float | None:
     """The angular frequency of a drive that the record shows beside a library of terms, in rad/s:
     of a force, and of a stiffness where it may be ``stiff``; None where it shows none, or one that
     is ``known``, of which no other search finds more."""
     left, count, waves = _left_of(problem, stiff)
-    if not count > OPTIONS.windows:
+    if not count > Options.windows:
         return None
     turn = 2 * np.pi / _duration(problem)
-    fastest = OPTIONS.fastest * problem.scales.omega
-    tried = np.arange(OPTIONS.fewest * turn, fastest, OPTIONS.spacing * turn)
+    fastest = Options.fastest * problem.scales.omega
+    tried = np.arange(Options.fewest * turn, fastest, Options.spacing * turn)
     if not len(tried):
         return None
     shares = np.array([left(omega) for omega in tried])
     best, found = _lowest(left, tried, shares)
-    beside = shares[np.abs(tried - best) > OPTIONS.width * turn]
+    beside = shares[np.abs(tried - best) > Options.width * turn]
     gain, others = (
         -np.log(max(float(share), 1e-300)) for share in (found.fun, min(beside, default=1.0))
     )
     chance = np.log(len(tried)) + 0.5 * waves * np.log(max(count, 1.0))
-    is_line = gain > OPTIONS.stands_out * others
+    is_line = gain > Options.stands_out * others
     is_seen = is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance
     omega = float(found.x)
-    is_known = any(abs(omega - one) < OPTIONS.spacing * turn for one in known)
+    is_known = any(abs(omega - one) < Options.spacing * turn for one in known)
     return omega if is_seen and not is_known and not _repeats(problem, omega) else None
 
 
@@ -97,7 +93,7 @@ def _lowest(
     there."""
     around, spacing = np.pad(shares, 1, constant_values=np.inf), float(np.ptp(tried[:2]))
     lows = np.flatnonzero((shares <= around[:-2]) & (shares <= around[2:]))
-    some = tried[lows[np.argsort(shares[lows])][: OPTIONS.lows]].tolist()
+    some = tried[lows[np.argsort(shares[lows])][: Options.lows]].tolist()
     found: list[tuple[float, Any]] = [
         (omega, minimize_scalar(left, bounds=(omega - spacing, omega + spacing), method="bounded"))
         for omega in some
@@ -115,11 +111,11 @@ def _repeats(problem: ArcProblem, omega: float) -> bool:
         q[late],
         np.median(problem.state_scale(problem.scales.sigma)[: problem.dim]),
     )
-    for part in OPTIONS.fractions:
-        turned = np.outer(t, omega / part * np.arange(OPTIONS.harmonics + 1))
+    for part in Options.fractions:
+        turned = np.outer(t, omega / part * np.arange(Options.harmonics + 1))
         waves = np.concatenate([np.cos(turned), np.sin(turned[:, 1:])], axis=1)
         rest = q - waves @ np.linalg.lstsq(waves, q, rcond=None)[0]
-        if np.sqrt(np.mean(rest**2)) < OPTIONS.noise * sigma:
+        if np.sqrt(np.mean(rest**2)) < Options.noise * sigma:
             return True
     return False
 
@@ -128,12 +124,12 @@ def with_frequency(fit: LawFit, omega: float) -> tuple[LawFit, float, float]:
     """A fit whose last two inputs are the waves of a frequency, with the frequency that fits best:
     it, and its standard error, in rad/s."""
     error = np.nan
-    apart = OPTIONS.apart * 2 * np.pi / _duration(fit.problem)
-    for _ in range(OPTIONS.most):
+    apart = Options.apart * 2 * np.pi / _duration(fit.problem)
+    for _ in range(Options.most):
         ahead, behind = (_driven(fit.problem, omega + by).inputs for by in (apart, -apart))
         slope = (ahead(fit.arcs) - behind(fit.arcs)) / (2 * apart)
         change, error = correction(fit, slope)
-        if not abs(change) > OPTIONS.settled * error:
+        if not abs(change) > Options.settled * error:
             break
         omega += change
         fit = fit.again(problem=_driven(fit.problem, omega))
@@ -167,13 +163,13 @@ def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float]
     terms = libraries.without_forces(rows, problem.observation.shifts())
     friction = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
     form = Structure(d, terms, friction, (), problem.num_inputs).form(problem.gauge)
-    lengths = [np.full(len(problem.nodes), one * problem.scales.period) for one in WINDOWS.lengths]
+    lengths = [np.full(len(problem.nodes), k * problem.scales.period) for k in OfWindows.lengths]
     windows = Windows.of(problem.nodes, lengths)
     X, y = weak_rows(form, windows)
     X, y = X.reshape(-1, X.shape[-1]), y.reshape(-1)
     X = X[:, X.any(axis=0)]
     U, s, _ = np.linalg.svd(X / np.linalg.norm(X, axis=0), full_matrices=False)
-    Q = U[:, s > OPTIONS.rank * np.max(s, initial=0.0)]
+    Q = U[:, s > Options.rank * np.max(s, initial=0.0)]
     y = y - Q @ (Q.T @ y)
     factors = _factors(windows.x[:, :d], angles, stiff).T[:, None]  # (n, 1, m)
     many = 2 * factors.shape[-1]
@@ -184,10 +180,10 @@ def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float]
         both = windows.along(waves * factors).reshape(-1, many)
         A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), many * d)
         A = A - Q @ (Q.T @ A)
-        c = np.linalg.lstsq(A, y, rcond=OPTIONS.rank)[0]
+        c = np.linalg.lstsq(A, y, rcond=Options.rank)[0]
         return float(np.sum((y - A @ c) ** 2) / max(np.sum(y**2), 1e-300))
 
-    return left, len(y) / WEAK.overlap, many * d
+    return left, len(y) / Weak.overlap, many * d
 
 
 def _factors(q: np.ndarray, angles: tuple[int, ...], stiff: bool) -> np.ndarray:

@@ -34,8 +34,7 @@ from gfnn_jax.models.lagrangians.structure import Loss, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import promising, protected
 
 
-@dataclasses.dataclass(frozen=True)
-class ExchangeOptions:
+class Options:
     """Limits of an exchange (`benchmarks/certificates.py`).
 
     most: terms that leave, and that come. imitated: share of what a term does that the others do
@@ -66,8 +65,7 @@ class ExchangeOptions:
     listed: int = 5
 
 
-OPTIONS = ExchangeOptions()
-_BEGUN = OPTIONS.screened * OPTIONS.fitted  # sets whose friction is looked at
+_BEGUN = Options.screened * Options.fitted  # sets whose friction is looked at
 
 
 class Exchanged(NamedTuple):
@@ -81,7 +79,7 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
     """The fit with terms (of ``every``) in place of as many or more of its own: the plainest of the
     fits against which the likeliest has no odds that decide, where held-out arcs do not lose."""
     deciding = fit.problem.options.evidence.deciding
-    for _ in range(OPTIONS.rounds):
+    for _ in range(Options.rounds):
         near = [_leaner(one, fit) for one in _near(fit, every)]
         near = [one for one in near if len(one.fit.p) <= len(fit.p) and _explains(one.fit, fit)]
         found = [Exchanged(fit, 0.0), *near]
@@ -100,9 +98,9 @@ def _explains(other: LawFit, fit: LawFit) -> bool:
     """Return whether another fit explains much of the residuals of one, where these are correlated:
     of their squares, or of their correlation, as chance does not."""
     return (
-        fit.correlation < OPTIONS.coloured
-        or other.fitted.cost < OPTIONS.explained * fit.fitted.cost
-        or other.correlation - 1 < OPTIONS.whiter * (fit.correlation - 1)
+        fit.correlation < Options.coloured
+        or other.fitted.cost < Options.explained * fit.fitted.cost
+        or other.correlation - 1 < Options.whiter * (fit.correlation - 1)
     )
 
 
@@ -156,7 +154,7 @@ def rivals(fit: LawFit, every: Structure) -> list[Exchanged]:
     """Lean laws of ``every`` against which a fit has no odds that decide, the likeliest first."""
     decide = fit.problem.options.evidence.deciding
     found = [one for one in _near(fit, every) if one.above < decide]
-    return sorted(found, key=lambda one: one.above)[: OPTIONS.listed]
+    return sorted(found, key=lambda one: one.above)[: Options.listed]
 
 
 def leaves_open(fit: LawFit, rival: Exchanged) -> bool:
@@ -212,12 +210,12 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
         return []  # a term of the library overflows along the arcs
     sets = screen.sets()
     likely = min([0.0, *(above for _, above in sets)]) + deciding
-    fewer = [one for one, above in sets if one < screen.own and above < likely + OPTIONS.far]
+    fewer = [one for one, above in sets if one < screen.own and above < likely + Options.far]
     about = [
         one
         for one, above in sets
         if one not in fewer
-        and above < likely + OPTIONS.slack
+        and above < likely + Options.slack
         and (above < -deciding or not screen.adds_little(one | screen.own))
     ]
     found: list[Exchanged] = []
@@ -231,7 +229,7 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
             if other is not None:
                 found.append(other)
                 smaller += [places] if other.above < deciding else []
-            if tried == OPTIONS.fitted:
+            if tried == Options.fitted:
                 break
     return found
 
@@ -295,7 +293,7 @@ class _Screen:
     @property
     def most(self) -> int:
         """Terms that leave, and that come; of many coordinates one, for pairs would be too many."""
-        return OPTIONS.most if self.larger.dim <= FEW else 1
+        return Options.most if self.larger.dim <= FEW else 1
 
     @cached_property
     def _products(self) -> np.ndarray:
@@ -309,7 +307,7 @@ class _Screen:
         rest = self.target - basis @ (basis.T @ self.target)
         new = self.columns[:, self.come] - basis @ shared
         size = np.linalg.norm(new, axis=0)
-        some = np.flatnonzero(size > OPTIONS.imitated)
+        some = np.flatnonzero(size > Options.imitated)
         shared, size, left = shared[:, some], size[some], float(rest @ rest)
         along = new[:, some].T @ rest / size
         gains = {(): 0.0} | {(k,): along[k] ** 2 for k in sorted(_largest(along**2, _BEGUN))}
@@ -324,9 +322,9 @@ class _Screen:
     ) -> dict[tuple[int, int], float]:
         """The pairs that explain most, and the sum of squares that each explains."""
         apart = self._products[np.ix_(some, some)] - shared.T @ shared
-        two = of_two(along, apart / np.outer(size, size), OPTIONS.imitated**2)
-        rows = _largest(two.max(axis=1, initial=0.0), 2 * OPTIONS.screened)
-        i, j = np.divmod(_largest(two[rows].ravel(), 2 * OPTIONS.screened), max(len(some), 1))
+        two = of_two(along, apart / np.outer(size, size), Options.imitated**2)
+        rows = _largest(two.max(axis=1, initial=0.0), 2 * Options.screened)
+        i, j = np.divmod(_largest(two[rows].ravel(), 2 * Options.screened), max(len(some), 1))
         pairs = {(min(one), max(one)) for one in zip(rows[i], j, strict=True) if np.ptp(one)}
         return {
             pair: float(two[pair]) for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))
@@ -357,7 +355,7 @@ class _Screen:
         """Return whether these terms hold what the fit has as a special case."""
         gone = self.columns[:, sorted(self.own - places)]
         basis = np.linalg.qr(self.columns[:, sorted(places)])[0]
-        return bool(np.all(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) < OPTIONS.same))
+        return bool(np.all(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) < Options.same))
 
     def is_the_same(self, places: frozenset[int]) -> bool:
         """Return whether these terms add little to the law; or a law of fewer terms, which is a sum
@@ -366,7 +364,7 @@ class _Screen:
             return True
         own, other = (np.linalg.qr(self.columns[:, sorted(some)])[0] for some in (self.own, places))
         turn, cosines, _ = np.linalg.svd(own.T @ other)
-        both = own @ turn[:, : np.count_nonzero(cosines > 1 - OPTIONS.same**2)]
+        both = own @ turn[:, : np.count_nonzero(cosines > 1 - Options.same**2)]
         if both.shape[1] >= min(len(self.own), len(places)):
             return False
         left = float(np.sum((self.target - both @ (both.T @ self.target)) ** 2))
@@ -384,7 +382,7 @@ class _Screen:
         before, after = self._errors(self.own), self._errors(places)
         values = dict(zip(sorted(self.own), self._solved(self.own)[0], strict=True))
         return not any(
-            after[i] > OPTIONS.vague * abs(values[i]) and after[i] > OPTIONS.vaguer * before[i]
+            after[i] > Options.vague * abs(values[i]) and after[i] > Options.vaguer * before[i]
             for i in self.leave
             if i in after
         )

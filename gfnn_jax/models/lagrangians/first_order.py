@@ -28,8 +28,7 @@ from gfnn_jax.models.lagrangians.nature import told_by_positions
 from gfnn_jax.solve.latent_arcs import Defects, Fitted, Readings, flow_defects, observed_whole
 
 
-@dataclasses.dataclass(frozen=True)
-class FirstOrderOptions:
+class Options:
     """Options of the rival (`benchmarks/any_record.py`, one orbit).
 
     degree: of the polynomials f, at most. columns: of them at most. as_well: times the law's
@@ -42,9 +41,6 @@ class FirstOrderOptions:
     as_well: float = 1.1
     rate: float = 0.3
     most: int = 8
-
-
-OPTIONS = FirstOrderOptions()
 
 
 def products(dim: int, angles: tuple[int, ...], degree: int) -> Terms:
@@ -126,20 +122,20 @@ def first_order(
     x, seen = arcs.x[..., :d], np.isfinite(arcs.y).all(axis=2)
     q, v = x[seen], arcs.x[..., d:][seen]
     h = np.diff(arcs.t, axis=1)
-    for degree in range(1, OPTIONS.degree + 1):
+    for degree in range(1, Options.degree + 1):
         library = products(d, angles, degree)
-        if library.num_parameters > OPTIONS.columns:
+        if library.num_parameters > Options.columns:
             break
         values, slopes = library.term_values(q), library.term_gradients(q).swapaxes(1, 2)
         size = np.linalg.norm(values, axis=0)
         c = (np.linalg.lstsq(values / size, v, rcond=1e-9)[0] / size[:, None]).T
         rate = np.abs(c @ slopes).sum(axis=2).max(axis=1)
-        fast = float(np.quantile(rate, 0.99) * np.max(h)) / OPTIONS.rate
+        fast = float(np.quantile(rate, 0.99) * np.max(h)) / Options.rate
         places = np.argwhere(np.ones_like(c, bool))
-        model = FieldOnArcs(library, places, h, int(np.clip(np.ceil(fast), 1, OPTIONS.most)))
+        model = FieldOnArcs(library, places, h, int(np.clip(np.ceil(fast), 1, Options.most)))
         found = _fitted(model, c.ravel(), arcs, x, sigma)
-        if found is not None and np.all(found.rms <= OPTIONS.as_well * most):
-            return _pruned(found, arcs, sigma, OPTIONS.as_well * most)
+        if found is not None and np.all(found.rms <= Options.as_well * most):
+            return _pruned(found, arcs, sigma, Options.as_well * most)
     return None
 
 

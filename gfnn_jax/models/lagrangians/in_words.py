@@ -41,8 +41,7 @@ from gfnn_jax.models.lagrangians.velocities import Velocity
 from gfnn_jax.models.lagrangians.weak_form import trend
 
 
-@dataclasses.dataclass(frozen=True)
-class WarningOptions:
+class Options:
     """Limits at which a law is not to be relied on (`benchmarks/as_a_user.py`).
 
     clear: standard errors of a gain, below which its input has no visible effect. many: functions
@@ -77,7 +76,6 @@ class WarningOptions:
     lost: float = 0.2
 
 
-OPTIONS = WarningOptions()
 Gains = dict[str, dict[str, tuple[float, float]]]
 
 
@@ -223,14 +221,14 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         "is not noise": "a force, an input or a change of the sensor is missing. law.png "
         "(fit.traces) shows when"
         for name, one in found.items()
-        if one.fit_percent < OPTIONS.followed and not one.white
+        if one.fit_percent < Options.followed and not one.white
     }
     rms, noise = best.fit.along_periods.rms(), best.fit.problem.scales.sigma
     missed = np.sqrt(np.maximum(rms**2 - noise**2, 0.0)) / best.fit.spread
     scales = best.fit.problem.scales
     for (name, one), size, sigma, share in zip(found.items(), rms, noise, missed, strict=True):
-        much = size > OPTIONS.beyond * sigma or share > OPTIONS.missed
-        if one.white or not OPTIONS.followed <= one.fit_percent < OPTIONS.nearly or not much:
+        much = size > Options.beyond * sigma or share > Options.missed
+        if one.white or not Options.followed <= one.fit_percent < Options.nearly or not much:
             continue
         over, remedy = one.smoothed_over(scales.period), ""
         if over:
@@ -243,8 +241,8 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
             f"{sigma:.1g}, and {one.fit_percent:.1f} % of its variation is followed"
         ] = remedy or ("a force, an input or a term is missing. law.png (fit.traces) shows when")
     least = np.min(best.calibration.median, axis=0, initial=np.inf)
-    beyond = np.isfinite(least) & (least > OPTIONS.lost)
-    if beyond.any() and np.max(best.fit.sigma / best.fit.spread) < OPTIONS.lost / 2:
+    beyond = np.isfinite(least) & (least > Options.lost)
+    if beyond.any() and np.max(best.fit.sigma / best.fit.spread) < Options.lost / 2:
         flaws["half of the forecasts of held-out parts err by a fifth of the spread"] = (
             "the law fits this record and no other part of it: record a longer motion, or more "
             "samples a period"
@@ -255,7 +253,7 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
             "record (--from, --to) or fewer terms (--terms)"
         )
     worst = min(one.fit_percent for one in found.values())
-    if best.choice.gains and worst < OPTIONS.complete:
+    if best.choice.gains and worst < Options.complete:
         flaws["the record gains energy that no input explains"] = (
             "a force is missing beside the inputs that are named"
             if best.law.num_inputs
@@ -280,7 +278,7 @@ def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) ->
         f"noise of {f'{noise:.2g} rad in' if name in angles else f'{share:.0%} of the spread of'} "
         f"{name} {HIDES}"
         for name, noise, share in shares
-        if (noise > OPTIONS.hides if name in angles else share > OPTIONS.lost / 2)
+        if (noise > Options.hides if name in angles else share > Options.lost / 2)
     )
 
 
@@ -303,7 +301,7 @@ def _trend(fit: LawFit, flawed: bool) -> dict[str, str]:
         plain = Structure(structure.dim, rows, structure.friction, (), structure.num_inputs)
         with contextlib.suppress(FitError):
             found = trend(plain, problem, rubs)
-            if found is not None and found[2] < (OPTIONS.left_rubbing if rubs else OPTIONS.left):
+            if found is not None and found[2] < (Options.left_rubbing if rubs else Options.left):
                 flaw = f"{problem.word(found[0])} may change along the record, by {found[1]:+.1%}"
                 flaw += " of it" + ", with fewer terms" * fewer
                 why = (
@@ -317,10 +315,10 @@ def _trend(fit: LawFit, flawed: bool) -> dict[str, str]:
 def _not_seen(gains: Gains) -> list[str]:
     """Warnings about inputs without a force."""
     return [
-        f"no force of the input {u} is seen: its gain is within {OPTIONS.clear:g} standard errors "
+        f"no force of the input {u} is seen: its gain is within {Options.clear:g} standard errors "
         f"of 0. Record a stronger or more varied {u}, or leave it out of --inputs"
         for u, forces in gains.items()
-        if all(abs(gain) < OPTIONS.clear * error for gain, error in forces.values())
+        if all(abs(gain) < Options.clear * error for gain, error in forces.values())
     ]
 
 
@@ -352,7 +350,7 @@ def about_parameters(
                 "law depends on it, as far as this recording shows"
             )
     count = len({tuple(args_of(recording, run, names).tolist()) for run in recording.runs})
-    if powers is not None and most_functions >= min(count, OPTIONS.many):
+    if powers is not None and most_functions >= min(count, Options.many):
         found.append(
             f"a term has {most_functions} functions of {', '.join(names)}, and the runs are of "
             f"{count} values: other functions agree there, and forecasts between and beyond may "
@@ -392,7 +390,7 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
         only += (f"M and V, of whose motion one energy was recorded: {ONLY_TOGETHER}",)
     return only + tuple(
         f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"
-        for i, j, rho in fit.linearised.collinear(OPTIONS.alike)
+        for i, j, rho in fit.linearised.collinear(Options.alike)
     )
 
 
@@ -401,14 +399,14 @@ def _is_of_one_energy(fit: LawFit) -> bool:
     V gives the same speed at each position, and a constant mass is no plain choice."""
     masses = [row for row in fit.structure.terms if row[0] == (2,)]
     potentials = [row for row in fit.structure.terms if not any(row[0])]
-    plain = all(map(is_constant, masses)) and len(potentials) < OPTIONS.series
+    plain = all(map(is_constant, masses)) and len(potentials) < Options.series
     if fit.form.dim > 1 or plain:
         return False
     law = fit.form.lagrangian(fit.p[: fit.form.count]).at(fit.problem.args)
     q, v = np.split(fit.problem.states, 2, axis=1)
     energy = np.quantile(law.energy(q, v), (0.05, 0.95))
     moving = 0.5 * law.masses(q)[:, 0, 0] * v[:, 0] ** 2
-    return bool(np.ptp(energy) < OPTIONS.energies * np.quantile(moving, 0.95))
+    return bool(np.ptp(energy) < Options.energies * np.quantile(moving, 0.95))
 
 
 def _energy(traces: Sequence[Trace], friction: Formula, inputs: tuple[str, ...]) -> dict[str, Any]:

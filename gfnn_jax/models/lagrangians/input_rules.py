@@ -36,8 +36,7 @@ RULES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class DelayOptions:
+class Options:
     """Options of the search for a delay (`benchmarks/measured.py`).
 
     apart: of a sample, by which inputs are differentiated. settled: standard errors, within which a
@@ -50,9 +49,6 @@ class DelayOptions:
     most: int = 4
     furthest: float = 1.0
     step: float = 1e-4
-
-
-OPTIONS = DelayOptions()
 
 
 class InputModel(NamedTuple):
@@ -134,12 +130,12 @@ def with_delay(fit: LawFit) -> InputModel:
     if not fit.structure.num_inputs or not fit.follows:
         return begun
     interval, significant = fit.problem.scales.dt, fit.problem.options.evidence.significant
-    for _ in range(OPTIONS.most):
+    for _ in range(Options.most):
         change, error = _correction(here)
         here = here._replace(error=error)
-        most = OPTIONS.furthest * interval
+        most = Options.furthest * interval
         delay = here.delay + np.clip(change, -most, most)
-        if not abs(change) > OPTIONS.settled * error or not abs(delay) > significant * error:
+        if not abs(change) > Options.settled * error or not abs(delay) > significant * error:
             break
         problem = here.fit.problem
         later = dataclasses.replace(problem, inputs=problem.inputs.delayed(delay))
@@ -155,7 +151,7 @@ def _correction(here: InputModel) -> tuple[float, float]:
     """The change of the delay that fits best, and its standard error, both in seconds; 0 and NaN
     where the coefficients imitate it."""
     fit, inputs = here.fit, here.fit.problem.inputs
-    apart = OPTIONS.apart * fit.problem.scales.dt
+    apart = Options.apart * fit.problem.scales.dt
     ahead, behind = (inputs.delayed(inputs.delay + by)(fit.arcs) for by in (apart, -apart))
     return correction(fit, (ahead - behind) / (2 * apart))
 
@@ -189,5 +185,5 @@ def _along_inputs(row: Row, count: int) -> Row:
 
         return with_leaves(tree_of(shape_of(row), d), later)
 
-    slope = (moved(OPTIONS.step) - moved(-OPTIONS.step)) * (0.5 / OPTIONS.step)
+    slope = (moved(Options.step) - moved(-Options.step)) * (0.5 / Options.step)
     return (*row[:4], to_text(slope, d, INPUTS), *row[5:])

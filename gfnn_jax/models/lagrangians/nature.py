@@ -21,7 +21,6 @@ one is ruled out:
 Shares are of squares that a polynomial explains in quarters of the record it was not fitted to.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -34,8 +33,7 @@ from gfnn_jax.signals.splines import Splines
 from gfnn_jax.solve.linear import non_negative
 
 
-@dataclasses.dataclass(frozen=True)
-class NatureOptions:
+class Options:
     """Limits (`benchmarks/any_record.py`, outside).
 
     still: share of equal neighbours, of steps. rough: power of time by which differences grow,
@@ -82,7 +80,6 @@ class NatureOptions:
     parts: int = 32
 
 
-OPTIONS = NatureOptions()
 NO_COLUMN = "a coordinate that no column shows"
 
 
@@ -112,7 +109,7 @@ def nature(
     whole runs, also where a body would be at rest; by default those of the stretches. field:
     equations of first order that follow it to its noise, "" where none were found."""
     still = np.mean(np.concatenate([np.diff(s.y, axis=0) == 0 for s in found]), axis=0).min()
-    if still > OPTIONS.still:
+    if still > Options.still:
         return Nature(
             "no law",
             f"steps: {100 * still:.0f} % of the samples are equal to the one before, as of a "
@@ -121,7 +118,7 @@ def nature(
         )
     runs = runs or [s.y for s in found]
     exponent = max(_power([y[:, k] for y in runs]) for k in range(runs[0].shape[1]))
-    if exponent < OPTIONS.rough:
+    if exponent < Options.rough:
         grows = f"as time to the power of {exponent:.2g}" if exponent > 0 else "by no more"
         return Nature(
             "not mechanical",
@@ -131,12 +128,12 @@ def nature(
         )
     q, v, a, u, block = _states(found, scales)
     real = _reliability(a, scales)
-    if real < OPTIONS.real:
+    if real < Options.real:
         return Nature("no law", "noise hides what its accelerations depend on")
     first = _best(_variables(q, angles), v, block)
     state = np.concatenate([_variables(q, angles), v / v.std(axis=0), u], axis=1)
     plain, alone = _best(state, a, block), q.shape[1] == 1  # one would not come back
-    if field or (not alone and first > max(OPTIONS.first, plain)):
+    if field or (not alone and first > max(Options.first, plain)):
         return Nature(
             "not mechanical",
             f"first order, or one orbit: positions determine {100 * first:.1f} % of the "
@@ -145,7 +142,7 @@ def nature(
             partly=False,
         )
     jumps, when = _jumps(found)
-    if jumps > OPTIONS.most:
+    if jumps > Options.most:
         return Nature(
             "no law",
             f"impacts: {100 * jumps:.0f} % of the squares of the accelerations are in peaks of a "
@@ -153,18 +150,18 @@ def nature(
             "record them finer where they are close passages",
         )
     rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
-    excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega and _lasts(found)
-    slow, fast = np.quantile(v, (OPTIONS.early, 1 - OPTIONS.early), axis=0)
+    excited = plain > Options.mostly and rate > Options.excited * scales.omega and _lasts(found)
+    slow, fast = np.quantile(v, (Options.early, 1 - Options.early), axis=0)
     excited &= bool(np.all((slow < 0) & (fast > 0)))  # else what it does at rest is not known
     if excited:
         places = np.concatenate([_variables(q, angles), u], axis=1)
-        excited = 1 - plain < OPTIONS.backwards * (1 - _reversible(places, v, a, block))
+        excited = 1 - plain < Options.backwards * (1 - _reversible(places, v, a, block))
     self_excited = Nature(
         "not mechanical",
         "self-excited: friction is negative where motion is slow, or small, "
         f"{rate:.2g} 1/s, and feeds the energy that faster or larger motion loses",
     )
-    if 1 - plain < OPTIONS.closed * max(1 - real, OPTIONS.bias):
+    if 1 - plain < Options.closed * max(1 - real, Options.bias):
         if excited:
             return self_excited
         return Nature(
@@ -179,8 +176,8 @@ def nature(
         max(rubbed, *(_best(state, a, block, np.hstack([dry, own[:, ::k]])) for k in (1, 2, 4, 8)))
         for own in (_slips(q), _past(q, period))
     )
-    rivals = OPTIONS.gains * (1 - rubbed), OPTIONS.beats * (1 - past)
-    if memory > OPTIONS.memory and 1 - memory < min(rivals):
+    rivals = Options.gains * (1 - rubbed), Options.beats * (1 - past)
+    if memory > Options.memory and 1 - memory < min(rivals):
         return Nature(
             "no law",
             "memory (hysteresis, or friction that yields before it slips), which no term has: "
@@ -188,12 +185,12 @@ def nature(
             f"past positions {100 * past:.4g} %, and with as many forces that slip "
             f"{100 * memory:.4g} %",
         )
-    near, mostly = _of_near_states(state, a, period), plain > OPTIONS.mostly
+    near, mostly = _of_near_states(state, a, period), plain > Options.mostly
     shares = (
         f"positions and velocities explain {100 * plain:.3g} % of the accelerations, with past "
         f"positions {100 * past:.3g} %"
     )
-    if near < OPTIONS.differ:
+    if near < Options.differ:
         return Nature(
             "no law",
             f"unrecorded: states that nearly coincide have other accelerations: {shares}. An input "
@@ -213,13 +210,13 @@ def nature(
 def told_by_positions(q: np.ndarray, v: np.ndarray, angles: Sequence[int]) -> bool:
     """Return whether positions q (n, d) in the order of time tell the velocities v (n, d), as of
     first order or along one orbit; of one coordinate they do not where it comes back."""
-    return q.shape[1] > 1 and _best(_variables(q, angles), v, _blocks(len(q))) > OPTIONS.first
+    return q.shape[1] > 1 and _best(_variables(q, angles), v, _blocks(len(q))) > Options.first
 
 
 def _power(columns: Sequence[np.ndarray]) -> float:
     """The power of time by which mean squares of differences of a column grow beyond the noise; 2
     where samples are too far apart to tell it."""
-    longest = min(OPTIONS.lags, max(map(len, columns)) // 4)
+    longest = min(Options.lags, max(map(len, columns)) // 4)
     if longest < 4:
         return 2.0
     apart = [np.concatenate([c[n:] - c[:-n] for c in columns]) for n in range(1, longest + 1)]
@@ -231,7 +228,7 @@ def _power(columns: Sequence[np.ndarray]) -> float:
     count = sum(len(column) for column in columns)
     if np.all(np.abs(1 - squares / whole) < 5 / np.sqrt(count)):
         return 0.0  # white
-    early = squares < OPTIONS.early * whole
+    early = squares < Options.early * whole
     last = len(told) if early.all() else int(np.argmin(early))
     if last < 4:
         return 2.0
@@ -247,7 +244,7 @@ def _states(
     found: Sequence[Stretch], scales: Scales
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """q, v, a, u (n, ·) at even samples of the stretches, and the block (n,) that each lies in."""
-    every = max(1, sum(len(s.t) for s in found) // OPTIONS.samples)
+    every = max(1, sum(len(s.t) for s in found) // Options.samples)
     parts = []
     for s in found:
         at = np.arange(1, len(s.t) - 1, every)
@@ -265,7 +262,7 @@ def _states(
 
 def _blocks(count: int) -> np.ndarray:
     """The block (count,) that each of samples in the order of time lies in."""
-    return np.arange(count) * OPTIONS.parts // count % OPTIONS.blocks
+    return np.arange(count) * Options.parts // count % Options.blocks
 
 
 def _reliability(a: np.ndarray, scales: Scales) -> float:
@@ -300,7 +297,7 @@ def _best(
     more = x[:, :0] if beside is None else beside
     shares = [
         _explained(np.concatenate([_products(x, degree), more], axis=1), target, block)
-        for degree in range(1, OPTIONS.degree + 1)
+        for degree in range(1, Options.degree + 1)
     ]
     return max(0.0, *shares)
 
@@ -311,9 +308,9 @@ def _reversible(x: np.ndarray, v: np.ndarray, target: np.ndarray, block: np.ndar
     (n, d)."""
     even = np.delete(_products(v / v.std(axis=0), 2), range(1, v.shape[1] + 1), axis=1)
     shares = [0.0]
-    for degree in range(1, 2 * OPTIONS.degree + 1):
+    for degree in range(1, 2 * Options.degree + 1):
         rows = (_products(x, degree)[:, :, None] * even[:, None]).reshape(len(x), -1)
-        if rows.shape[1] > len(x) / OPTIONS.blocks:
+        if rows.shape[1] > len(x) / Options.blocks:
             break  # which would explain chance
         shares.append(_explained(rows, target, block))
     return max(shares)
@@ -334,14 +331,14 @@ def _explained(rows: np.ndarray, target: np.ndarray, block: np.ndarray) -> float
 def _rate_at_rest(state: np.ndarray, a: np.ndarray, first: int) -> float:
     """The largest ∂a/∂v (1/s) of a coordinate at rest in the middle of the positions, of states
     whose speeds stand from place ``first`` on, in units of which a (n, d) is."""
-    rows = _products(state, OPTIONS.degree)
+    rows = _products(state, Options.degree)
     c = np.linalg.lstsq(rows, a, rcond=1e-8)[0]
     middle, rates = np.mean(state, axis=0), []
     for i in range(a.shape[1]):
         ends = np.tile(middle, (2, 1))
         ends[:, first : first + a.shape[1]] = 0.0
         ends[:, first + i] = [-0.05, 0.05]
-        low, high = _products(ends, OPTIONS.degree) @ c[:, i]
+        low, high = _products(ends, Options.degree) @ c[:, i]
         rates.append((high - low) / 0.1)
     return float(max(rates))
 
@@ -351,8 +348,8 @@ def _lasts(found: Sequence[Stretch]) -> bool:
     for s in found:
         x = s.q - np.nanmean(s.q, axis=0)
         early, late = np.array_split(x, 2)
-        turns = np.sum(np.diff(np.sign(x), axis=0) != 0, axis=0) >= OPTIONS.turns
-        if np.any(turns & (np.nanstd(late, axis=0) > OPTIONS.lasts * np.nanstd(early, axis=0))):
+        turns = np.sum(np.diff(np.sign(x), axis=0) != 0, axis=0) >= Options.turns
+        if np.any(turns & (np.nanstd(late, axis=0) > Options.lasts * np.nanstd(early, axis=0))):
             return True
     return False
 
@@ -361,7 +358,7 @@ def _jumps(found: Sequence[Stretch]) -> tuple[float, float]:
     """The share of the squares of accelerations in narrow peaks, and when the largest is; of the
     column that has the largest share. Those of readings that are close count for less: their
     noise does."""
-    best, width = (0.0, 0.0), OPTIONS.width
+    best, width = (0.0, 0.0), Options.width
     for k in range(found[0].q.shape[1]):
         whole, times, peaks = 0.0, [], []
         read = [(s.t[seen], s.q[seen, k]) for s in found if sum(seen := np.isfinite(s.q[:, k])) > 2]
@@ -396,7 +393,7 @@ def _of_near_states(x: np.ndarray, target: np.ndarray, period: float) -> float:
         return 1.0
     distance = np.sum((x[others] - x[known][:, None]) ** 2, axis=2).mean(axis=0)
     differ = 0.5 * np.mean((target[others] - target[known][:, None]) ** 2, axis=0)
-    if distance[0] > OPTIONS.near**2:
+    if distance[0] > Options.near**2:
         return 1.0
     rows = np.stack([np.ones(len(order)), distance], axis=1)
     at_none = np.linalg.lstsq(rows, differ, rcond=None)[0][0]
@@ -410,7 +407,7 @@ def _shifted(x: np.ndarray, by: int) -> np.ndarray:
 
 def _past(q: np.ndarray, period: float) -> np.ndarray:
     """Past positions (n, d w), as many within a ``period`` of samples as there are slips."""
-    size, n = (q - q.mean(axis=0)) / q.std(axis=0), len(OPTIONS.slips)
+    size, n = (q - q.mean(axis=0)) / q.std(axis=0), len(Options.slips)
     back = np.arange(len(q))[:, None] - np.round(np.arange(1, n + 1) * period / n).astype(int)
     return size[np.maximum(back, 0)].transpose(0, 2, 1).reshape(len(q), -1)
 
@@ -420,7 +417,7 @@ def _slips(q: np.ndarray) -> np.ndarray:
     columns = []
     for x in ((q - q.mean(axis=0)) / np.abs(q - q.mean(axis=0)).max(axis=0)).T:
         steps = np.diff(x, prepend=x[0])
-        for way in OPTIONS.slips:
+        for way in Options.slips:
             force, last = np.empty_like(x), 0.0
             kept, sides = np.exp(-np.abs(steps) / way).tolist(), np.sign(steps).tolist()
             for k, (keep, side) in enumerate(zip(kept, sides, strict=True)):

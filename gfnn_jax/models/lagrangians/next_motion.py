@@ -19,8 +19,7 @@ from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.structure import Key
 
 
-@dataclasses.dataclass(frozen=True)
-class MotionOptions:
+class Options:
     """Options of the motions that are compared (`tests/test_next_motion.py`).
 
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
@@ -37,9 +36,6 @@ class MotionOptions:
     largest: float = 1e100
     turns: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
     known: float = 1e-9
-
-
-OPTIONS = MotionOptions()
 
 
 class Drive(NamedTuple):
@@ -82,14 +78,14 @@ def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
     here = problem.linearised(structure, fit).among(own)
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
-    found = [told for times in OPTIONS.intervals for told in _told(fit, own, list(steered), times)]
+    found = [told for times in Options.intervals for told in _told(fit, own, list(steered), times)]
     if not found:
         return []
     motions, each = zip(*found, strict=True)
     left, gains = _after(here.columns, np.stack(each))
     named = [structure.keys()[k] for k in own]
     gained = [{named[j]: float(row[j]) for j in np.argsort(-row)} for row in gains]
-    return [motions[k]._replace(gains=gained[k]) for k in np.argsort(left)[: OPTIONS.most]]
+    return [motions[k]._replace(gains=gained[k]) for k in np.argsort(left)[: Options.most]]
 
 
 def _told(
@@ -101,7 +97,7 @@ def _told(
     middle, reach = _middle(fit)
     begun = [(start, None) for start in _starts(fit)]
     begun += [(middle, drive) for drive in _drives(fit, steered, times)]
-    reach = max(OPTIONS.further) * reach
+    reach = max(Options.further) * reach
     lanes, inputs, h = _lanes(fit, begun, times)
     for (start, drive), lane, u in zip(begun, lanes, inputs, strict=True):
         if not np.isfinite(lane).all() or (drive and np.any(abs(lane[:, :d] - middle) > reach)):
@@ -111,7 +107,7 @@ def _told(
         arcs = Arcs(t, y, lane[None], np.ones(y.shape), home)
         acted = dataclasses.replace(problem, inputs=lambda arcs, own=u[None]: own)
         there = acted.linearised(structure, fit, arcs).among(own)
-        if np.abs(there.columns).max() < OPTIONS.largest:  # else a small change grows without bound
+        if np.abs(there.columns).max() < Options.largest:  # else a small change grows without bound
             yield Motion(start, h, {}, drive=drive), there.columns
 
 
@@ -122,7 +118,7 @@ def _after(here: np.ndarray, each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scale = np.linalg.norm(here, axis=0)
     here, each = (columns / np.where(scale > 0, scale, 1.0) for columns in (here, each))
     known = here.T @ here
-    least = OPTIONS.known * np.linalg.eigvalsh(known)[-1] * np.eye(len(known))
+    least = Options.known * np.linalg.eigvalsh(known)[-1] * np.eye(len(known))
     before, told = np.linalg.inv(known + least), each.swapaxes(1, 2) @ each
     after = np.linalg.inv(known + least + told)
     left = np.tensordot(after, told, axes=([1, 2], [1, 2]))  # traces of products
@@ -154,9 +150,9 @@ def _starts(fit: LawFit) -> list[np.ndarray]:
     elif d > 1:
         shapes += [np.array((1.0, *signs)) for signs in product((1.0, -1.0), repeat=d - 1)]
     starts = []
-    for shape, further in product(shapes, OPTIONS.further):
+    for shape, further in product(shapes, Options.further):
         q = middle + further * reach * shape
-        q[angles] = np.clip(q[angles], -OPTIONS.highest, OPTIONS.highest)
+        q[angles] = np.clip(q[angles], -Options.highest, Options.highest)
         if not any(np.allclose(q, other) for other in starts):
             starts.append(q)
     return starts
@@ -175,7 +171,7 @@ def _drives(fit: LawFit, steered: Sequence[int], times: int) -> list[Drive]:
     high, low = np.nanmax(u, axis=0), np.nanmin(u, axis=0)
     long = times * float(np.max(fit.arcs.t[:, -1] - fit.arcs.t[:, 0]))
     return [
-        Drive(i, float(high[i]), float(low[i]), long / n) for i in steered for n in OPTIONS.turns
+        Drive(i, float(high[i]), float(low[i]), long / n) for i in steered for n in Options.turns
     ]
 
 

@@ -142,8 +142,7 @@ def _summed(steps: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
-@dataclasses.dataclass(frozen=True)
-class RecordingOptions:
+class Options:
     """Limits at which a law is refused, and at which one of shorter arcs is taken
     (`benchmarks/as_a_user.py`, `measured.py`).
 
@@ -167,7 +166,6 @@ class RecordingOptions:
     early: float = 0.01
 
 
-OPTIONS = RecordingOptions()
 DRIVEN = (
     "a drive that no column shows acts at {} rad/s: its waves stand among the inputs, with the "
     "phase of the times in the file. Record the drive, and name it: --inputs"
@@ -328,7 +326,7 @@ def fit_recording(
 def _with_early_inputs(law: LearnedLaw, dt: float) -> LearnedLaw:
     """The law, with a flaw where its inputs act before they were measured."""
     delay, error = law.delay or (0.0, 0.0)
-    if not -delay > max(error, OPTIONS.early * dt):
+    if not -delay > max(error, Options.early * dt):
         return law
     flaw = f"inputs act {measured(-delay, error)} s before they were measured"
     messages = (*law.messages, f"{flaw}: {EARLY}")
@@ -376,16 +374,16 @@ def _with_rivals(
 
 def _is_no_law(law: LearnedLaw) -> bool:
     """Return whether a law leaves nearly all of every channel."""
-    least = 100 * (1 - OPTIONS.missed)
+    least = 100 * (1 - Options.missed)
     return all(one.fit_percent < least for one in law.whiteness.values())
 
 
 def _loses_a_channel(law: LearnedLaw) -> bool:
     """Return whether a law leaves much of a channel that is no noise."""
     return any(
-        one.fit_percent < OPTIONS.followed
+        one.fit_percent < Options.followed
         and not one.white
-        and law.residual[name] > OPTIONS.above_noise * law.noise[name]
+        and law.residual[name] > Options.above_noise * law.noise[name]
         for name, one in law.whiteness.items()
     )
 
@@ -522,7 +520,7 @@ def _check_moves(recording: Recording) -> None:
     for name in columns:
         values = np.concatenate([recording.values(name, run) for run in recording.runs])
         seen = values[np.isfinite(values)]
-        if len(seen) and np.ptp(seen) > OPTIONS.still * np.abs(seen).max():
+        if len(seen) and np.ptp(seen) > Options.still * np.abs(seen).max():
             return
     if columns:
         raise InputError(
@@ -625,7 +623,7 @@ def samples_of(
         )
     options = options or SearchOptions()
     if observation.crossed:
-        options = dataclasses.replace(options, periods=OPTIONS.periods_of_events)
+        options = dataclasses.replace(options, periods=Options.periods_of_events)
     nodes = nodes_of(found, scales)
     if not nodes:
         raise FitError(
@@ -752,7 +750,7 @@ def _with_hidden_drive(
     except FitError as error:
         missed, problem, loud = error, samples_of(recording).problem, np.inf
     seen = not recording.inputs and problem.observation.hidden is None
-    searches, tried = loud > OPTIONS.above_noise and seen, list[float]()
+    searches, tried = loud > Options.above_noise and seen, list[float]()
     for stiff in (False, True) if searches else ():
         if (omega := hidden_frequency(problem, stiff, tried)) is None:
             continue
@@ -763,10 +761,10 @@ def _with_hidden_drive(
         tried.append(omega)
         with contextlib.suppress(FitError):
             _, law = searched(driven, "band")
-            if law.fit.loudest < OPTIONS.explained * loud:
+            if law.fit.loudest < Options.explained * loud:
                 _, omega, error = with_frequency(law.fit, omega)
                 driven, law = searched(recording.driven_by(wave_names(omega)), "band")
-                if law.fit.loudest < min(OPTIONS.above_noise, OPTIONS.explained * loud):
+                if law.fit.loudest < min(Options.above_noise, Options.explained * loud):
                     return driven, law, (DRIVEN.format(measured(omega, error)),)
     if data is None or found is None:
         raise missed
@@ -785,15 +783,15 @@ def _louder_with(fit: LawFit, driven: Recording, stiff: bool) -> bool:
     structure = dataclasses.replace(fit.structure, num_inputs=count).plus(new)
     arcs = arcs_of(problem.nodes, fit.arcs.t.shape[1])
     more = problem.fit(structure, fit.values, arcs, fit.sigma)
-    return not more.loudest < OPTIONS.explained * fit.loudest
+    return not more.loudest < Options.explained * fit.loudest
 
 
 def _misses(fit: LawFit) -> bool:
     """Return whether a law leaves nearly all of the variation of every channel, or of one that is
     no noise."""
     left = fit.rms()
-    missed = left > OPTIONS.missed * fit.spread
-    loud = left > OPTIONS.above_noise * fit.problem.scales.sigma
+    missed = left > Options.missed * fit.spread
+    loud = left > Options.above_noise * fit.problem.scales.sigma
     return bool(np.all(missed) or np.any(missed & loud))
 
 
@@ -807,7 +805,7 @@ def _forecasting_best(
     if found.shorter is None:
         return found, []
     longer, shorter = (CalibratedLaw.of(data, f.fit, f.choice) for f in (found, found.shorter))
-    ahead = OPTIONS.ahead * data.problem.scales.period
+    ahead = Options.ahead * data.problem.scales.period
     apart = shorter.calibration.against(longer.calibration, ahead)
     data.problem.on_progress(
         f"the law of shorter arcs: held-out forecasts err by {apart.cost:.3g} times as much "
@@ -844,7 +842,7 @@ def _check_identifiable(fit: LawFit) -> None:
     """Raises FitError where the record does not tell a sensor's parameters from the law."""
     names = fit.problem.observation.parameters
     for name, k in zip(names, range(len(fit.p) - len(names), len(fit.p)), strict=True):
-        if not fit.linearised.unimitated(k) > OPTIONS.imitated:
+        if not fit.linearised.unimitated(k) > Options.imitated:
             raise FitError(
                 f"{name}: not identifiable from this record, for coefficients of the law act as it "
                 "does. Write its value into --observe, or leave it out"

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-@dataclasses.dataclass(frozen=True)
-class WhitenessOptions:
+class Options:
     """Limits of the test (`benchmarks/as_a_user.py`).
 
     lags: nodes, up to which residuals are correlated. beyond: standard deviations of a correlation
@@ -25,9 +24,6 @@ class WhitenessOptions:
     lags: int = 20
     beyond: float = 3.0
     brief: float = 0.125
-
-
-OPTIONS = WhitenessOptions()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,7 +73,7 @@ class Whiteness(NamedTuple):
         chance = self.bound * np.sqrt(1 + 2 * np.sum(rho**2))
         beyond = np.flatnonzero(np.abs(rho) > chance)
         first = beyond[-1] + 2 if len(beyond) and beyond[-1] + 2 < len(self.lags) else 0
-        return float(self.lags[first]) if self.lags[first] < OPTIONS.brief * period else 0.0
+        return float(self.lags[first]) if self.lags[first] < Options.brief * period else 0.0
 
     @property
     def text(self) -> str:
@@ -104,8 +100,8 @@ def whiteness(
     for k, name in enumerate(channels):
         r = [np.clip(trace.residuals[:, k], -5, 5) for trace in traces]  # outliers count as five σ
         count = sum(int(np.isfinite(one).sum()) for one in r)
-        rho = np.array([_correlation(r, r, lag) for lag in range(OPTIONS.lags + 1)])
-        bound = OPTIONS.beyond / np.sqrt(max(count, 1))
+        rho = np.array([_correlation(r, r, lag) for lag in range(Options.lags + 1)])
+        bound = Options.beyond / np.sqrt(max(count, 1))
         colour = 1 + 2 * float(np.sum(rho[1:].clip(min=0)))
         of_inputs = {}
         for j, u in enumerate(inputs):
@@ -113,7 +109,7 @@ def whiteness(
             series = [trace.inputs[:, j] - mean for trace in traces]
             both = {
                 lag: _correlation(series, r, lag)
-                for lag in range(-OPTIONS.lags // 4, OPTIONS.lags + 1)
+                for lag in range(-Options.lags // 4, Options.lags + 1)
             }
             best = max(both, key=lambda lag: abs(both[lag]))
             significant = bool(abs(both[best]) > bound * np.sqrt(colour))
@@ -124,7 +120,7 @@ def whiteness(
         percent = 100 * (1 - np.sqrt(np.nanmean(left**2)) / max(spread, 1e-300))
         white = bool(np.all(np.abs(rho[1:]) < bound))
         found[name] = Whiteness(
-            step * np.arange(OPTIONS.lags + 1), rho, bound, white, of_inputs, float(percent)
+            step * np.arange(Options.lags + 1), rho, bound, white, of_inputs, float(percent)
         )
     return found
 

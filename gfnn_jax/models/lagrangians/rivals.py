@@ -51,8 +51,7 @@ from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure, is_
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
 
 
-@dataclasses.dataclass(frozen=True)
-class RivalOptions:
+class Options:
     """Limits of what is tried (`benchmarks/any_record.py`, `vocabulary.py`).
 
     most: powers of the distance to either side. series: potentials, from which on they may be the
@@ -87,7 +86,6 @@ class RivalOptions:
     told: float = 10.0
 
 
-OPTIONS = RivalOptions()
 SENSORS = (  # of a position q with the velocity v
     ("is not in proportion to what moves", "{q} + bend*{q}**3"),
     (
@@ -117,7 +115,7 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
 def fades(direction: Sequence[int], problem: ArcProblem) -> list[float]:
     """Speeds, to two digits, over which Stribeck's friction may fade, from the least on."""
     speed = float(problem.scales.speed @ np.abs(direction))
-    return [float(f"{speed * one:.2g}") for one in OPTIONS.fades]
+    return [float(f"{speed * one:.2g}") for one in Options.fades]
 
 
 def as_it_fades(row: Loss, fit: LawFit) -> Loss:
@@ -141,7 +139,7 @@ def with_fading(fit: LawFit) -> LawFit:
     for row in fit.structure.friction:
         if row[1] != STRIBECK or not fit.follows:
             continue
-        for _ in range(OPTIONS.corrections):
+        for _ in range(Options.corrections):
             other = (*row[:2], float(f"{_best_speed(fit, row):.3g}"))
             turned = tuple(other if one == row else one for one in fit.structure.friction)
             known = {("loss", other) if k == ("loss", row) else k: c for k, c in fit.values.items()}
@@ -150,7 +148,7 @@ def with_fading(fit: LawFit) -> LawFit:
             if not found.follows or not found.fitted.cost < fit.fitted.cost:
                 break
             change, fit, row = abs(np.log(other[2] / row[2])), found, other
-            if change < OPTIONS.as_fast:
+            if change < Options.as_fast:
                 break
     return fit if fit is begun else fit.again()
 
@@ -159,7 +157,7 @@ def _best_speed(fit: LawFit, row: Loss) -> float:
     """The speed over which Stribeck friction of a fit would fade where the linearised problem
     leaves least."""
     slow, *_, fast = fades(row[0], fit.problem)
-    speeds = np.geomspace(slow, fast, OPTIONS.speeds)
+    speeds = np.geomspace(slow, fast, Options.speeds)
     tried = [("loss", (*row[:2], float(speed))) for speed in speeds]
     larger, others = fit.structure.plus(tried), fit.structure.without({("loss", row)})
     near = fit.problem.linearised(larger, fit)
@@ -209,7 +207,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
         shifted, many = fit.problem.observation.shifts(), len(series)
         plain = () if d == 1 else without_forces(potentials(d, range(d), 1, 2), shifted)
         tried = _Shapes(fit, kept, plain, "1")
-    alone = many >= (2 if driven else OPTIONS.series) and not (driven and d > 1)
+    alone = many >= (2 if driven else Options.series) and not (driven and d > 1)
     if not alone or fit.problem.angles or not fit.follows:
         return fit
     lengths = [(1,)] if d == 1 else _lengths_of(series)
@@ -260,14 +258,14 @@ class _Shapes:
     def nearest(self, name: str, along: Sequence[int]) -> tuple[float, float]:
         """The constant of a few that leaves least, and what it leaves."""
         q = self.fit.problem.states[:, : len(along)] @ np.array(along)
-        sizes = np.array(OPTIONS.constants) / np.ptp(q)
+        sizes = np.array(Options.constants) / np.ptp(q)
         tried = {a: self.left(name, along, a) for a in (*sizes, *-sizes)}
         return min(tried.items(), key=lambda one: one[1])
 
     def fitted(self, name: str, along: Sequence[int], near: float) -> LawFit | None:
         """The fit with the constant that is likeliest near this one, without the plain terms that
         are not likely; None where no orbit follows."""
-        finer = near * np.geomspace(0.5, 2.0, OPTIONS.finer)  # beyond some a shape may be singular
+        finer = near * np.geomspace(0.5, 2.0, Options.finer)  # beyond some a shape may be singular
         at = int(np.argmin([self.left(name, along, a) for a in finer]))
         ends = sorted(finer[[max(at - 1, 0), min(at + 1, len(finer) - 1)]])
         left = partial(self.left, name, along)
@@ -309,11 +307,11 @@ def _lengths_of(rows: Sequence[Row]) -> list[tuple[int, ...]]:
 def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
     """The fit with the number inside its shapes corrected, as long as that is more than a tenth of
     its standard error."""
-    for _ in range(OPTIONS.corrections):
+    for _ in range(Options.corrections):
         change, error = constant_of(fit)[1:]
-        if not fit.follows or not abs(change) > OPTIONS.settled * error:
+        if not fit.follows or not abs(change) > Options.settled * error:
             break
-        by = 1 + float(np.clip(change, -OPTIONS.furthest, OPTIONS.furthest))
+        by = 1 + float(np.clip(change, -Options.furthest, Options.furthest))
         turned = {row: _scaled(row, by) for row in fit.structure.terms}
         structure = dataclasses.replace(fit.structure, terms=tuple(turned.values()))
         known = {("term", turned[k[1]]) if k[0] == "term" else k: c for k, c in fit.values.items()}
@@ -328,7 +326,7 @@ def constant_of(fit: LawFit) -> tuple[float, float, float]:
     if not changes or not fit.follows:
         return number, 0.0, np.nan
     larger = fit.structure.plus(list(changes))
-    return number, *fit.along(changes, larger, least=OPTIONS.imitated)
+    return number, *fit.along(changes, larger, least=Options.imitated)
 
 
 def widened(fit: LawFit) -> dict[Key, float]:
@@ -350,9 +348,9 @@ def _by_constant(fit: LawFit) -> tuple[float, dict[Key, float]]:
         if own := constants(row):
             last = own[0]
             more, less = (
-                tree_of(shape_of(_scaled(row, 1 + by)), d) for by in (OPTIONS.apart, -OPTIONS.apart)
+                tree_of(shape_of(_scaled(row, 1 + by)), d) for by in (Options.apart, -Options.apart)
             )
-            slope = to_text((more - less) * (0.5 / OPTIONS.apart), d, INPUTS)
+            slope = to_text((more - less) * (0.5 / Options.apart), d, INPUTS)
             changes["term", (*row[:4], slope, *row[5:])] = fit.values["term", row]
     return last, changes
 
@@ -417,7 +415,7 @@ def unseen(fit: LawFit) -> str:
     held = [any(row[1][i] > 1 or shape_of(row) for row in structure.terms) for i in range(d)]
     free = [i for i in fit.problem.lengths if not held[i]]
     pulls = [[("term", row) for row in potentials(d, [i], 2, 1)] for i in free]
-    return _moving("no spring is seen, but", pulls, fit, OPTIONS.much)
+    return _moving("no spring is seen, but", pulls, fit, Options.much)
 
 
 def _moving(what: str, each: Sequence[list[Key]], fit: LawFit, least: float) -> str:
@@ -443,7 +441,7 @@ def _moving(what: str, each: Sequence[list[Key]], fit: LawFit, least: float) -> 
         }
         if far:
             word, other = (fit.problem.word(k) for k in (max(far, key=far.__getitem__), new[0]))
-            by, most = max(far.values()), OPTIONS.told
+            by, most = max(far.values()), Options.told
             share = f"{by:.2g} of itself" if by < most else f"more than {most:g} times itself"
             lines.append(f"{other} as large as the record allows moves {word} by {share}")
     return f"{what} {'; '.join(lines)}" if lines else ""
@@ -463,14 +461,14 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
     plain = dataclasses.replace(plain, zeros=())
     odd = {key for key in fit.values if key[0] in ("term", "loss")} - set(plain.keys())
-    is_noise = fit.loudest < OPTIONS.noise or smoothed
+    is_noise = fit.loudest < Options.noise or smoothed
     if not seen.is_plain or problem.parameters or (is_noise and not odd):
         return "", smoothed
     known, count, best, enough = {}, fit.independent, "", smoothed
     if not is_noise or len(plain.keys()) <= len(fit.p):  # else it is not as likely
         with contextlib.suppress(FitError):
             known = weak_start(plain, problem, prune=False)[1]
-    least = fit.criterion() + OPTIONS.clearly * (1 if is_noise else -1)
+    least = fit.criterion() + Options.clearly * (1 if is_noise else -1)
     alone = d == 1 and not problem.num_inputs  # and may be late unseen
     for i, name in enumerate(seen.coordinates):
         q, v = symbols((name, seen.speeds[i]))
@@ -486,11 +484,11 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
                 own = dataclasses.replace(structure, sensors=other.sensors)
                 again = other.fit(own, start, fit.followed, fit.sigma, rescale=False)
                 unlikely = again.criterion(count)
-                most = max(OPTIONS.noise, OPTIONS.explains * fit.loudest)
+                most = max(Options.noise, Options.explains * fit.loudest)
                 follows = smoothed or again.loudest < most
                 if again.is_definite and follows and unlikely < least and _is_a_sensor(again):
                     typed, least = shlex.quote(f"{name} = {text}"), unlikely
-                    enough = smoothed or again.loudest < OPTIONS.noise
+                    enough = smoothed or again.loudest < Options.noise
                     best = (
                         f"a plainer law follows the record where {name} {what}: --observe {typed}"
                     )
@@ -549,7 +547,7 @@ def _as_likely(fit: LawFit, own: float) -> dict[float, LawFit]:
 
     for step in (-0.5, 0.5):
         first = np.ceil(2 * own) / 2 if step < 0 else np.floor(2 * own) / 2
-        for a in (first + step * np.arange(1, OPTIONS.most + 1)).tolist():
+        for a in (first + step * np.arange(1, Options.most + 1)).tolist():
             if a in taken:
                 continue
             other = fit.again(_with_power(fit, own, a), rescale=False)

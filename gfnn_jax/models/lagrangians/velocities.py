@@ -32,8 +32,7 @@ from gfnn_jax.signals.derivatives import difference
 from gfnn_jax.signals.local_polynomials import choose_half
 
 
-@dataclasses.dataclass(frozen=True)
-class VelocityOptions:
+class Options:
     """Limits at which measured velocities are used (`benchmarks/measured.py`).
 
     wrong: of the noise, that scale, lag and bias may make up. chance: standard deviations of what
@@ -45,9 +44,6 @@ class VelocityOptions:
     chance: float = 3.0
     coloured: float = 0.2
     near: int = 8
-
-
-OPTIONS = VelocityOptions()
 
 
 class Velocity(NamedTuple):
@@ -114,9 +110,9 @@ def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
         tau = correlation_time(left[..., None] / sigma)
         error = sigma * np.sqrt(tau) * problem.errors
         share = float(np.sqrt(np.mean(made[finite] ** 2))) / sigma
-        chance = OPTIONS.chance / np.sqrt(finite.sum())
-        white = _colour(left) < max(OPTIONS.coloured, chance) and not _copied(recording, i, name)
-        allowed = max(OPTIONS.wrong, chance * np.sqrt(3 * tau))
+        chance = Options.chance / np.sqrt(finite.sum())
+        white = _colour(left) < max(Options.coloured, chance) and not _copied(recording, i, name)
+        allowed = max(Options.wrong, chance * np.sqrt(3 * tau))
         found[name] = Velocity(
             (1 + float(beta[0]), float(error[0])),
             (-float(beta[1]), float(error[1])),
@@ -151,7 +147,7 @@ def read_from_the_start(recording: Recording) -> Recording | None:
 def _colour(left: np.ndarray) -> float:
     """The largest correlation of noise (A, L) with that of near nodes, of either sign."""
     power = np.nanmean(left**2)
-    near = range(1, min(OPTIONS.near, left.shape[1] - 1) + 1)
+    near = range(1, min(Options.near, left.shape[1] - 1) + 1)
     beside = [left[:, k:] * left[:, :-k] for k in near]
     return max(
         (abs(float(np.nanmean(b) / power)) for b in beside if np.isfinite(b).any()), default=0.0

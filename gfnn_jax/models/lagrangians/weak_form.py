@@ -35,8 +35,7 @@ from gfnn_jax.models.lagrangians.structure import (
 from gfnn_jax.models.lagrangians.windows import Windows
 
 
-@dataclasses.dataclass(frozen=True)
-class WeakOptions:
+class Options:
     """Options of the weak form (`benchmarks/random_recordings.py`).
 
     overlap: rows that share samples, of which as many count as one.
@@ -63,9 +62,6 @@ class WeakOptions:
     far: float = 0.03
     torque: float = 1e-4
     some: float = 0.01
-
-
-OPTIONS = WeakOptions()
 
 
 def protected(structure: Structure, others: bool = False) -> set[Key]:
@@ -105,8 +101,8 @@ class _Equations(NamedTuple):
         X, fixed = weak_rows(form, windows)
         Y = -fixed
         if np.any(form.friction.dry):
-            least = OPTIONS.slow * np.sqrt(np.mean(problem.states[:, d:] ** 2, axis=0))
-            held = windows.mean(1.0 * (np.abs(windows.x[:, d:]) < least)) > OPTIONS.held
+            least = Options.slow * np.sqrt(np.mean(problem.states[:, d:] ** 2, axis=0))
+            held = windows.mean(1.0 * (np.abs(windows.x[:, d:]) < least)) > Options.held
             X[held], Y[held] = 0.0, 0.0  # held by any force up to that of sliding
         keys = structure.keys()[: form.count]
         keep = [k for k in range(form.count) if np.any(X[..., k])]
@@ -171,14 +167,14 @@ def weak_start(
             rows = X[..., keep] * weight[:, None]
             c, residual, inverse = _solve(rows, Y * weight)
             size = np.sqrt(np.mean(residual**2, axis=0))
-            if not np.min(size) > OPTIONS.rounding * np.linalg.norm(rows * c):
+            if not np.min(size) > Options.rounding * np.linalg.norm(rows * c):
                 raise FitError(
                     "terms: a combination of them vanishes all along the recording, so that their "
                     "coefficients are not determined. Leave one out, or add a force"
                 )
             told = weight / size / unit
-            weight = unit * np.maximum(told, np.max(told) / OPTIONS.apart)
-        error = np.sqrt(OPTIONS.overlap * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
+            weight = unit * np.maximum(told, np.max(told) / Options.apart)
+        error = np.sqrt(Options.overlap * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
         z = [
             np.inf if keys[k] in fixed else abs(value) / e
             for k, value, e in zip(keep, c, error, strict=True)
@@ -199,7 +195,7 @@ def promising(fit: LawFit, every: Structure) -> Structure:
     leaves of the equations of motion, each by itself: derivatives of all along the arcs would take
     long, and much memory."""
     rows = [row for row in every.terms if row not in fit.structure.terms]
-    if len(rows) <= OPTIONS.many:
+    if len(rows) <= Options.many:
         return every
     d, windows = every.dim, Windows.longest(fit.problem.nodes, fit.problem.scales)
 
@@ -223,15 +219,15 @@ def promising(fit: LawFit, every: Structure) -> Structure:
         return part - basis @ (basis.T @ part)
 
     rest, explains = apart(flat(left[..., None]))[:, 0], []
-    for k in range(0, len(rows), OPTIONS.block):
-        some = rows[k : k + OPTIONS.block]
+    for k in range(0, len(rows), Options.block):
+        some = rows[k : k + Options.block]
         whole = flat(columns(Terms.of(some, d, every.leaders), Friction.of([], d)))
         new = apart(whole)
-        size, least = (np.linalg.norm(part, axis=0) for part in (new, OPTIONS.imitated * whole))
+        size, least = (np.linalg.norm(part, axis=0) for part in (new, Options.imitated * whole))
         explains += np.where(
             size > least, np.abs(rest @ new) / np.maximum(size, 1e-300), 0.0
         ).tolist()
-    best = sorted(np.argsort(explains)[-OPTIONS.kept :].tolist())
+    best = sorted(np.argsort(explains)[-Options.kept :].tolist())
     return dataclasses.replace(every, terms=(every.terms[0], *(rows[k] for k in best)))
 
 
@@ -289,12 +285,12 @@ def centre_of_forces(problem: ArcProblem) -> np.ndarray:
     for taken in ((0,), (0, 3, 4), (0, 1, 2), (0, 1, 2, 3, 4)):
         X = np.concatenate([parts[k] for k in taken], axis=1)
         c, left, inverse = _solve(X[:, None], Y[:, None])
-        error = np.sqrt(OPTIONS.overlap * np.mean(left**2)) * np.linalg.norm(inverse[:d])
+        error = np.sqrt(Options.overlap * np.mean(left**2)) * np.linalg.norm(inverse[:d])
         found.append((error, np.sum(left**2) / max(size, 1e-300), c[:d]))
-    plain = [one for one in found if one[1] < OPTIONS.torque]
+    plain = [one for one in found if one[1] < Options.torque]
     error, share, c = plain[0] if plain else min(found, key=lambda one: one[0])
-    near = max(OPTIONS.far * np.linalg.norm(spread), problem.options.evidence.significant * error)
-    return c if share < OPTIONS.some and np.linalg.norm(c) > near else np.zeros(d)
+    near = max(Options.far * np.linalg.norm(spread), problem.options.evidence.significant * error)
+    return c if share < Options.some and np.linalg.norm(c) > near else np.zeros(d)
 
 
 def weak_rows(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
@@ -334,7 +330,7 @@ def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     flat = X.reshape(X.shape[0] * X.shape[1], X.shape[2])
     scale = np.linalg.norm(flat, axis=0)
     Q, R = np.linalg.qr(flat / scale)
-    inverse = np.linalg.pinv(R, rcond=OPTIONS.rank)
+    inverse = np.linalg.pinv(R, rcond=Options.rank)
     c = inverse @ (Q.T @ Y.reshape(-1))
     residual = Y - (flat / scale @ c).reshape(Y.shape)
     return c / scale, residual, inverse / scale[:, None]

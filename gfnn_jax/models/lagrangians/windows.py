@@ -14,8 +14,7 @@ from scipy.sparse import csr_array, vstack
 from gfnn_jax.dataset.stretches import Nodes, Scales
 
 
-@dataclasses.dataclass(frozen=True)
-class WindowOptions:
+class Options:
     """Options of windows (`benchmarks/random_recordings.py`).
 
     lengths: in periods. periods: of the longest run, below which windows are shorter too, for there
@@ -28,9 +27,6 @@ class WindowOptions:
     fewest: int = 7
     spacing: float = 0.25
     most: int = 3_000_000
-
-
-OPTIONS = WindowOptions()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,14 +67,14 @@ class Windows:
         most = 0.999 * spans if scales.uneven else np.inf
         period = _period(spans, scales)
         return cls.of(
-            nodes, [np.minimum(one * period + 0 * spans, most) for one in OPTIONS.lengths]
+            nodes, [np.minimum(one * period + 0 * spans, most) for one in Options.lengths]
         )
 
     @classmethod
     def longest(cls, nodes: Sequence[Nodes], scales: Scales) -> Windows:
         """Make windows of the largest of the usual lengths alone, along the nodes as they are."""
         spans = np.array([np.ptp(n.t) for n in nodes])
-        return cls.of(nodes, [OPTIONS.lengths[-1] * _period(spans, scales) + 0 * spans])
+        return cls.of(nodes, [Options.lengths[-1] * _period(spans, scales) + 0 * spans])
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """Return the means (windows, ...) of values (n, ...) over the nodes inside each window."""
@@ -95,7 +91,7 @@ class Windows:
 
     def parts(self, width: int) -> Iterator[Windows]:
         """Windows of parts of the nodes, whose integrals add up, for so many numbers a node."""
-        count = -(-len(self.t) * width // OPTIONS.most)
+        count = -(-len(self.t) * width // Options.most)
         edges = np.linspace(0, len(self.t), count + 1).astype(int).tolist()
         for a, b in pairwise(edges):
             t, x, u, args = (one[a:b] for one in (self.t, self.x, self.u, self.args))
@@ -108,7 +104,7 @@ class Windows:
 
 
 def _period(spans: np.ndarray, scales: Scales) -> float:
-    return min(scales.period, float(np.max(spans)) / OPTIONS.periods)
+    return min(scales.period, float(np.max(spans)) / Options.periods)
 
 
 def _summed(weights: csr_array, values: np.ndarray) -> np.ndarray:
@@ -120,9 +116,9 @@ def _bumps(times: Sequence[np.ndarray], lengths: np.ndarray) -> tuple[csr_array,
     """φ dt and φ̇ dt, each (windows, n), of windows of a length along each of the times."""
     begin, found = 0, []
     for t, length in zip(times, lengths.tolist(), strict=True):
-        starts = np.arange(t[0], t[-1] - length, OPTIONS.spacing * length)
+        starts = np.arange(t[0], t[-1] - length, Options.spacing * length)
         first, last = np.searchsorted(t, starts), np.searchsorted(t, starts + length)
-        keep = last - first >= OPTIONS.fewest
+        keep = last - first >= Options.fewest
         own = starts[keep], first[keep] + begin, last[keep] + begin, np.full(np.sum(keep), length)
         found.append(own)
         begin += len(t)

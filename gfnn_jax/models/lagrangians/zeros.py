@@ -30,8 +30,7 @@ from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
 from gfnn_jax.solve.noise import Wander
 
 
-@dataclasses.dataclass(frozen=True)
-class ZeroOptions:
+class Options:
     """Options of the search for zeros of channels (`benchmarks/measured.py`).
 
     fewest: runs, since two tell one difference and no scatter. rank: a zero that moves residuals
@@ -46,15 +45,12 @@ class ZeroOptions:
     times: tuple[float, float] = (0.1, 10.0)
 
 
-OPTIONS = ZeroOptions()
-
-
 def with_zeros_of_runs(fit: LawFit) -> LawFit:
     """The fit, with zeros of its runs taken off, and fitted anew, where they have some."""
     problem, evidence = fit.problem, fit.problem.options.evidence
     names = sorted({n.stretch.run for n in problem.nodes})
     plain = problem.observation.is_plain
-    if len(names) < OPTIONS.fewest or not plain or not fit.follows:
+    if len(names) < Options.fewest or not plain or not fit.follows:
         return fit
     found = _zeros_of_runs(fit, names)
     if found is None:
@@ -119,8 +115,8 @@ def _held_out(rows: np.ndarray) -> np.ndarray:
 
 
 def _solved(rows: np.ndarray) -> np.ndarray:
-    flat = rows.reshape(-1, rows.shape[-1])  # in units of the rows: see `ZeroOptions.rank`
-    return np.linalg.lstsq(flat[:, :-1], flat[:, -1], rcond=OPTIONS.rank)[0]
+    flat = rows.reshape(-1, rows.shape[-1])  # in units of the rows: see `Options.rank`
+    return np.linalg.lstsq(flat[:, :-1], flat[:, -1], rcond=Options.rank)[0]
 
 
 def wander_of(fit: LawFit) -> Wander | None:
@@ -139,13 +135,13 @@ def wander_of(fit: LawFit) -> Wander | None:
         return _likelihood(mixed, m, free) + logs
 
     here, best = (1.0, 1.0), likelihood(1.0, 1.0)
-    for step in OPTIONS.factors:
+    for step in Options.factors:
         moved = True
         while moved:
             moved = False
             for factors in ((step, 1), (1 / step, 1), (1, step), (1, 1 / step)):
-                size = float(np.clip(here[0] * factors[0], *OPTIONS.sizes))
-                periods = float(np.clip(here[1] * factors[1], *OPTIONS.times))
+                size = float(np.clip(here[0] * factors[0], *Options.sizes))
+                periods = float(np.clip(here[1] * factors[1], *Options.times))
                 found = likelihood(size, periods)
                 if found > best + 0.01:
                     here, best, moved = (size, periods), found, True

@@ -26,7 +26,6 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the linear problem of S(q, Q), and of its data (benchmarks/positions.py)."""
 
@@ -38,8 +37,6 @@ class Options:
     # of a displacement, by which mixed derivatives of terms are differences
     difference: float = 1e-4
 
-
-OPTIONS = Options()
 
 _HALF_TURN = np.pi  # moves of two lifts differ by whole turns
 
@@ -128,7 +125,7 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
         )
     dt = float(np.median(np.concatenate(steps)))
     off = np.abs(np.concatenate(steps) - dt).max()
-    if off > OPTIONS.even * dt:
+    if off > Options.even * dt:
         raise FitError(
             f"{recording.source}: a map needs positions at even times; the step is {dt:g} s, and "
             f"some are off by {off:.2g} s. A law takes uneven times: --learn lagrangian"
@@ -196,12 +193,12 @@ def solve(family: Any, triples: Triples) -> Solved:
     moves = (w[:, triples.dim :] - w[:, : triples.dim]) / triples.dt**2
     target = np.concatenate([-moves, moves], axis=1)
     rows = family.term_gradients(w).reshape(target.size, -1)
-    free = np.linalg.lstsq(rows, target.ravel(), rcond=OPTIONS.null)[0]
+    free = np.linalg.lstsq(rows, target.ravel(), rcond=Options.null)[0]
     free = free / (mixed @ free)
     # The changes of S that leave the mixed term as it is: all but the first column of Q.
     others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
     u, values, v = np.linalg.svd(triangle @ others, full_matrices=False)
-    determined = values > OPTIONS.null * values[0]
+    determined = values > Options.null * values[0]
     along = u[:, determined].T @ (triangle @ free)
     coefficients = free - others @ (v[determined].T @ (along / values[determined]))
     condition = float(values[0] / values[determined][-1])
@@ -222,7 +219,7 @@ def _mixed_terms(family: Any, triples: Triples) -> np.ndarray:
     """Mean of −h² ∂²/∂q_i∂Q_i of every term of S, weighed as above: (m,)."""
     dim, w, size = triples.dim, _sample(triples), displacement(triples)
     total = np.zeros(family.num_parameters)
-    for i, step in enumerate(OPTIONS.difference * size):
+    for i, step in enumerate(Options.difference * size):
         off = np.zeros(2 * dim)
         off[i] = step
         ahead, behind = (family.term_gradients(v)[:, dim + i] for v in (w + off, w - off))
@@ -232,13 +229,13 @@ def _mixed_terms(family: Any, triples: Triples) -> np.ndarray:
 
 def _sample(triples: Triples) -> np.ndarray:
     """Sample of the points w = (q, Q)."""
-    return triples.ends[:: max(1, 2 * len(triples) * triples.dim // OPTIONS.sampled)]
+    return triples.ends[:: max(1, 2 * len(triples) * triples.dim // Options.sampled)]
 
 
 def _folded(family: Any, triples: Triples) -> np.ndarray:
     """The triangular factor (m, m) of all equations, part by part: memory stays that of a part."""
     m, size = family.num_parameters, displacement(triples)
-    part = max(1, (4 * m + OPTIONS.rows) // triples.dim)
+    part = max(1, (4 * m + Options.rows) // triples.dim)
     rows = np.empty((0, m))
     for first in range(0, len(triples), part):
         new = equations(family, triples.take(slice(first, first + part)), size)

@@ -35,7 +35,6 @@ from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Readings
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the fit to latent positions (benchmarks/positions.py)."""
 
@@ -50,8 +49,6 @@ class Options:
     passes: float = 32.0  # over the rows: some four iterations, twice, with all derivatives
     most_operations: float = 20000000000.0  # of one size: about a minute
 
-
-OPTIONS = Options()
 
 _OF_EQUATION = np.sqrt(3)  # noise of an equation, in that of a reading, about
 
@@ -80,13 +77,13 @@ def arcs_of(triples: Triples) -> np.ndarray:
     many, or of many degrees of freedom, every so many."""
     stretches = triples.stretches()
     sizes = np.array([len(s) for s in stretches])
-    longest = min(int(sizes.max()) - 1, OPTIONS.longest)
+    longest = min(int(sizes.max()) - 1, Options.longest)
     used = [np.sum(sizes // (nodes + 1)) * (nodes - 1) for nodes in range(2, longest + 1)]
     span = 3 + int(np.argmax(used))
     cut = [
         s[first : first + span] for s in stretches for first in range(0, len(s) - span + 1, span)
     ]
-    most = max(span, min(OPTIONS.most_nodes, int(OPTIONS.most_numbers / (2 * triples.dim) ** 2)))
+    most = max(span, min(Options.most_nodes, int(Options.most_numbers / (2 * triples.dim) ** 2)))
     return np.array(cut[:: -(-len(cut) * span // most)])
 
 
@@ -111,13 +108,13 @@ def fit_latent(
     equations = len(arcs) * (arcs.shape[1] - 2) * dim
     # Residuals of readings are smaller than the noise by what the unknowns take of them.
     left = np.sqrt(arcs.size / max(equations - determined, 1))
-    for _ in range(OPTIONS.scales):
+    for _ in range(Options.scales):
         scale = np.tile(sigma, 2)
         found = Readings(model, y, scale).fit(p, x, scale)
         p, x = found.p, found.x
         change = _size(found.residuals, dim) * left
         sigma = sigma * change
-        if np.all(np.abs(np.log(change)) < np.log(OPTIONS.settled)):
+        if np.all(np.abs(np.log(change)) < np.log(Options.settled)):
             break
     root = np.linalg.pinv(found.triangle).T @ solved.determined.T * np.exp(np.mean(np.log(change)))
     coefficients = solved.free + solved.determined @ p
@@ -141,7 +138,7 @@ def held_out_cost(
 def _size(residuals: np.ndarray, dim: int) -> np.ndarray:
     """(d,) root mean square of residuals (A, L, 2d) of each coordinate, gross ones left out."""
     r = residuals.reshape(-1, 2, dim)
-    gross = np.abs(r) > OPTIONS.gross * np.nanmedian(np.abs(r), axis=(0, 1)) / 0.6745
+    gross = np.abs(r) > Options.gross * np.nanmedian(np.abs(r), axis=(0, 1)) / 0.6745
     return np.sqrt(np.nanmean(np.where(gross, np.nan, r) ** 2, axis=(0, 1)))
 
 
@@ -166,8 +163,8 @@ def without_noise(
     best: Latent | None = None
     sigma, worse = None, 0
     for family in families:
-        work = OPTIONS.passes * arcs.size * (family.num_parameters + 2 * training.dim) ** 2
-        if best is not None and work > OPTIONS.most_operations:
+        work = Options.passes * arcs.size * (family.num_parameters + 2 * training.dim) ** 2
+        if best is not None and work > Options.most_operations:
             break
         try:
             with budget.unit(f"latent positions, S of {family.label}", FLOW, work):
@@ -182,7 +179,7 @@ def without_noise(
             worse += 1
         else:
             best, sigma, worse = Latent(family, fit, solved), fit.sigma, 0
-        if worse == OPTIONS.worse:
+        if worse == Options.worse:
             break
     if best is None:
         return None

@@ -1,6 +1,5 @@
 """The dictionary of the atoms that are tried, and the states at which they are looked at."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, combinations, combinations_with_replacement, permutations, product
 from typing import Any, NamedTuple
@@ -22,8 +21,7 @@ from gfnn_jax.models.textbook.atoms import (
 from gfnn_jax.models.textbook.shapes import COSH, TURNING, Kind, constants_for, has_constant, values
 
 
-@dataclasses.dataclass(frozen=True)
-class DictionaryOptions:
+class Options:
     """Tuned on the laws of benchmarks/textbook.py.
 
     degrees: of products of coordinates, by degrees of freedom from 1; 3 beyond. coarse: of the
@@ -50,7 +48,6 @@ class DictionaryOptions:
     )
 
 
-OPTIONS = DictionaryOptions()
 _Group = Iterator[tuple[list[Atom], np.ndarray]]  # atoms, gradients (atoms, N, 2d)
 
 
@@ -99,7 +96,7 @@ class Setting:
     @property
     def degree(self) -> int:
         """The highest degree of products of coordinates."""
-        degrees = OPTIONS.degrees
+        degrees = Options.degrees
         return degrees[self.dim - 1] if self.dim <= len(degrees) else 3
 
     def flat(self, gradient: np.ndarray) -> np.ndarray:
@@ -156,7 +153,7 @@ class Setting:
         kept = np.flatnonzero(np.isfinite(size) & (size > 0))
         columns = beside(self.spanned, (rows[kept] / size[kept, None]).T)
         size = np.linalg.norm(columns, axis=0)
-        independent = np.flatnonzero(size > OPTIONS.independent)
+        independent = np.flatnonzero(size > Options.independent)
         atoms = [atoms[kept[i]] for i in independent]
         return Dictionary(atoms, columns[:, independent] / size[independent])
 
@@ -177,7 +174,7 @@ class Setting:
                     found.append(((Factor(place, COSH, float(theta)),),))
         for highest in range(3, self.degree + 1):
             block = tuple(self._monomials(highest, alone=True))
-            if block and len(block) <= OPTIONS.most_monomials:
+            if block and len(block) <= Options.most_monomials:
                 found.append(block)
         return found
 
@@ -220,7 +217,7 @@ class Setting:
                     square, pole = Factor(k, ("power", 2.0)), Factor(place, ("power", -1.0))
                     both: list[Atom] = [(square, pole), (Factor(place, ("power", -2.0)),)]
                     horizon: Kind = ("pole", 0.0)
-                    radii = constants_for(horizon, argument.value)[:: OPTIONS.coarse].tolist()
+                    radii = constants_for(horizon, argument.value)[:: Options.coarse].tolist()
                     found.append(tuple(both))
                     found += [(*both, (Factor(place, horizon, theta),)) for theta in radii]
         return found
@@ -238,7 +235,7 @@ class Setting:
 
     def _of_products(self) -> _Group:
         """Products with a shape of something else."""
-        every = OPTIONS.coarse if 2 * self.dim <= OPTIONS.small else None
+        every = Options.coarse if 2 * self.dim <= Options.small else None
         coarse = [singles(place, x, every) for place, x in enumerate(self.arguments)]
         entering = [x.entering for x in self.arguments]
         for multiplier in self._multipliers():
@@ -258,17 +255,17 @@ class Setting:
         beyond."""
 
         def grid(x: np.ndarray, points: int) -> list[float]:
-            middle, half = 0.5 * (x.min() + x.max()), 0.5 * OPTIONS.wider * np.ptp(x)
+            middle, half = 0.5 * (x.min() + x.max()), 0.5 * Options.wider * np.ptp(x)
             return np.linspace(middle - half, middle + half, points).tolist()
 
         for place, argument in enumerate(self.arguments):
             if not argument.axes:
                 continue
-            points = dict(OPTIONS.centres)[len(argument.axes)]
+            points = dict(Options.centres)[len(argument.axes)]
             for centre in product(*(grid(x.value, points) for x in argument.axes)):
                 moved = argument.around(centre)
-                slopes = np.array([values(kind, moved.value, None)[1] for kind in OPTIONS.central])
-                atoms = [(Factor(place, kind, centre=centre),) for kind in OPTIONS.central]
+                slopes = np.array([values(kind, moved.value, None)[1] for kind in Options.central])
+                atoms = [(Factor(place, kind, centre=centre),) for kind in Options.central]
                 yield atoms, slopes[:, :, None] * moved.gradient
 
     @property

@@ -29,8 +29,7 @@ from gfnn_jax.models.textbook.dictionary import Dictionary, Setting
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 
 
-@dataclasses.dataclass(frozen=True)
-class MatchingOptions:
+class Options:
     """Tuned on the laws of benchmarks/textbook.py.
 
     beam: states that go on. paired: atoms, those that explain most, whose pairs are tried.
@@ -57,7 +56,6 @@ class MatchingOptions:
     penalty: float = 0.5
 
 
-OPTIONS = MatchingOptions()
 _DAMPING = Factors(first=1e-2, shrunk_by=0.1, least=5e-4, trials=4)  # of inner constants
 
 
@@ -91,7 +89,7 @@ class Matching:
     bring.
     """
 
-    def __init__(self, setting: Setting, target: np.ndarray, penalty: float = OPTIONS.penalty):
+    def __init__(self, setting: Setting, target: np.ndarray, penalty: float = Options.penalty):
         self.setting, self.arguments, self.base = setting, setting.arguments, setting.spanned
         self.target, self._penalty = target, penalty
         self.size = float(np.linalg.norm(target))
@@ -119,13 +117,13 @@ class Matching:
                         grown.setdefault(frozenset(refined.atoms), refined)
             if not grown:
                 break
-            beam = sorted(grown.values(), key=self.cost)[: OPTIONS.beam]
+            beam = sorted(grown.values(), key=self.cost)[: Options.beam]
             found.update({frozenset(m.atoms): m for m in beam})
         return sorted(found.values(), key=self.cost)
 
     def cost(self, match: Match) -> float:
         """The logarithm of what is left over, and the penalty on the complexity of the atoms."""
-        left = np.log2(max(match.left, OPTIONS.floor))
+        left = np.log2(max(match.left, Options.floor))
         return float(left + self._penalty * match.complexity)
 
     def plainer(self, match: Match, dictionary: Dictionary) -> Match:
@@ -136,7 +134,7 @@ class Matching:
             tried = self._exchanged(match, i, dictionary, lambda a, s=own: complexity_of((a,)) < s)
             if tried:
                 best = min(tried, key=self.cost)
-                match = best if best.left < OPTIONS.hardly * match.left else match
+                match = best if best.left < Options.hardly * match.left else match
         return match
 
     def exchanged(self, match: Match, dictionary: Dictionary) -> list[Match]:
@@ -174,7 +172,7 @@ class Matching:
         if not inner:
             return Match(atoms, left)
         start = _AtConstants(self, tuple(inner), Match(atoms, left))
-        return descended(start, _DAMPING, OPTIONS.refinements).problem.match
+        return descended(start, _DAMPING, Options.refinements).problem.match
 
     def slopes(self, match: Match, inner: Sequence[tuple[int, int]]):
         """(residual, its slopes (rows, n) in these constants with base and coefficients
@@ -224,15 +222,15 @@ class Matching:
             return []
         own, columns = basis[:, self.base.shape[1] :], dictionary.columns
         part, size = self._parts(residual, own, columns)
-        independent, gain = size > OPTIONS.independent, part**2
+        independent, gain = size > Options.independent, part**2
         atoms = dictionary.atoms
         found = _apart((atoms[i],) for i in np.argsort(-gain))
         if len(match.atoms) + 2 > most:
             return found
-        top = np.argsort(-gain)[: OPTIONS.paired]
+        top = np.argsort(-gain)[: Options.paired]
         top = top[independent[top]]
         unit = (columns[:, top] - own @ (own.T @ columns[:, top])) / size[top]
-        both = of_two(part[top], unit.T @ unit, OPTIONS.alike)
+        both = of_two(part[top], unit.T @ unit, Options.alike)
         order = np.argsort(-np.triu(both, 1), axis=None)
         pairs = (tuple(atoms[top[i]] for i in divmod(int(k), len(top))) for k in order)
         return found + _apart(pairs)
@@ -249,7 +247,7 @@ class Matching:
         where little of a column is left, and the lengths that are left. Columns are without the
         base already."""
         size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
-        large = size > OPTIONS.independent
+        large = size > Options.independent
         return np.where(large, residual @ columns / np.where(large, size, 1.0), 0.0), size
 
     def moved(self, atoms: tuple[Atom, ...], step: np.ndarray) -> tuple[Atom, ...]:
@@ -264,7 +262,7 @@ class Matching:
                         factor.theta
                         + np.clip(next(changes), -0.7 * abs(factor.theta), abs(factor.theta))
                     )
-                far = OPTIONS.farthest * np.abs(self.arguments[factor.place].value).max()
+                far = Options.farthest * np.abs(self.arguments[factor.place].value).max()
                 moved += [c + np.clip(next(changes), -far, far) for c in factor.centre]
             found.append(with_constants(atom, map(float, moved)))
         return tuple(found)
@@ -300,15 +298,15 @@ class _AtConstants:
 
     def moved(self, there: Match, damping: float) -> tuple[_AtConstants, bool]:
         """The match of a step; settled where it gained little."""
-        settled = 1 - there.left / self.match.left < OPTIONS.gained
+        settled = 1 - there.left / self.match.left < Options.gained
         return dataclasses.replace(self, match=there), settled
 
 
 def _apart(found: Iterable[tuple[Atom, ...]]) -> list[tuple[Atom, ...]]:
     """The first of each kind of atoms, whatever their constants: few of them."""
     kinds: dict[tuple, tuple[Atom, ...]] = {}
-    for atoms in islice(found, OPTIONS.looked_at):
+    for atoms in islice(found, Options.looked_at):
         kinds.setdefault(tuple(tuple(f.form for f in atom) for atom in atoms), atoms)
-        if len(kinds) == OPTIONS.branches:
+        if len(kinds) == Options.branches:
             break
     return list(kinds.values())

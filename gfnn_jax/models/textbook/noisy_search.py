@@ -20,7 +20,6 @@ so that several are handed on; whole sequences choose.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from itertools import count, islice
 from typing import Any, NamedTuple
@@ -36,8 +35,7 @@ from gfnn_jax.models.textbook.matching import Match, Matching
 from gfnn_jax.phase_space import apply_j
 
 
-@dataclasses.dataclass(frozen=True)
-class NoisyTextbookOptions:
+class Options:
     """Tuned on the laws of benchmarks/textbook.py with noise of 1e-3 of the spread.
 
     atoms: of a law, beside the
@@ -75,9 +73,6 @@ class NoisyTextbookOptions:
     over: float = 2.0
 
 
-OPTIONS = NoisyTextbookOptions()
-
-
 class WeakGradients(NamedTuple):
     """The windows of some sequences.
 
@@ -112,22 +107,22 @@ def weak_gradients(
 ) -> WeakGradients | None:
     """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate.
     None where no sequence is as long as a window, or turns slowly enough for one."""
-    u = np.arange(1, OPTIONS.states + 1) / (OPTIONS.states + 1) * 2 - 1
-    bump = (1 - u**2) ** OPTIONS.power
+    u = np.arange(1, Options.states + 1) / (Options.states + 1) * 2 - 1
+    bump = (1 - u**2) ** Options.power
     bump /= bump.sum()
-    slope = u * (1 - u**2) ** (OPTIONS.power - 1)
-    time = np.arange(OPTIONS.states) * dt
+    slope = u * (1 - u**2) ** (Options.power - 1)
+    time = np.arange(Options.states) * dt
     slope /= slope @ time  # of a state that moves at rate 1 the mean rate is 1
     states, noises, measured, places, count = [], [], [], [], 0
     for sequence in sequences:
-        if len(sequence) < OPTIONS.states:
+        if len(sequence) < Options.states:
             continue
         smooth, left = _smoothed(sequence, noise)
         states.append(smooth)
         noises.append(np.tile(left, (len(sequence), 1)))
         measured.append(sequence)
-        first = count + np.arange(0, len(sequence) - OPTIONS.states + 1, OPTIONS.every)
-        places.append(first[:, None] + np.arange(OPTIONS.states))
+        first = count + np.arange(0, len(sequence) - Options.states + 1, Options.every)
+        places.append(first[:, None] + np.arange(Options.states))
         count += len(sequence)
     if not states:
         return None
@@ -135,7 +130,7 @@ def weak_gradients(
     own = own[_followed(whole[own], noise)]
     if not len(own):
         return None
-    own = own[:: -(-len(own) // OPTIONS.most)]
+    own = own[:: -(-len(own) // Options.most)]
     used, place = np.unique(own, return_inverse=True)
     rate = np.einsum("w,rwi->ri", slope, whole[own])
     deviation = np.roll(noise, len(noise) // 2) * np.linalg.norm(slope)
@@ -175,21 +170,21 @@ def gradients_of_pairs(
 def _followed(windows: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """(R,) which windows (R, w, 2d) polynomials follow to their noise (2d,)."""
     count = windows.shape[1]
-    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, count), OPTIONS.follows + 1))[0]
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, count), Options.follows + 1))[0]
     over = windows - np.einsum("wk,vk,rvi->rwi", basis, basis, windows)
     left = np.sqrt(np.sum(over**2, axis=1) / (count - basis.shape[1]))
-    return (left <= OPTIONS.over * noise).all(axis=1)
+    return (left <= Options.over * noise).all(axis=1)
 
 
 def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sequence (L, 2d) smoothed as far as its orbit allows, and the noise (2d,) left on it."""
     from scipy.signal import savgol_coeffs, savgol_filter  # takes a second: loaded when first used
 
-    for size in OPTIONS.smoothed:
-        kept = float(savgol_coeffs(size, OPTIONS.degree)[size // 2])  # of a state's own noise
-        smooth = np.asarray(savgol_filter(sequence, size, OPTIONS.degree, axis=0))
+    for size in Options.smoothed:
+        kept = float(savgol_coeffs(size, Options.degree)[size // 2])  # of a state's own noise
+        smooth = np.asarray(savgol_filter(sequence, size, Options.degree, axis=0))
         left = np.sqrt(np.mean((sequence - smooth) ** 2, axis=0))
-        if (left <= OPTIONS.biased * np.sqrt(1 - kept) * noise).all():
+        if (left <= Options.biased * np.sqrt(1 - kept) * noise).all():
             return smooth, np.sqrt(kept) * noise
     return sequence, noise
 
@@ -220,7 +215,7 @@ class Formula(NamedTuple):
     @property
     def length(self) -> float:
         """Description length: natural logarithms."""
-        penalty = OPTIONS.penalty * self.complexity + 0.5 * np.log(self.rows) * len(self.p)
+        penalty = Options.penalty * self.complexity + 0.5 * np.log(self.rows) * len(self.p)
         return self.rows * np.log(self.left) + penalty
 
     @property
@@ -296,15 +291,15 @@ class NoisyTextbook:
                 first = self._searched(products)[0]
                 self._weigh(self._deviations(first))
                 found = self._searched(products)
-                if found[0].left <= OPTIONS.explained:
+                if found[0].left <= Options.explained:
                     break
-            return found[: OPTIONS.finalists]
+            return found[: Options.finalists]
 
     def _searched(self, products: bool) -> list[Formula]:
         """The laws of each kind, by rising length."""
         found: dict[frozenset, Formula] = {}
         for match in sorted(self._matches(products), key=self._length_of_match)[
-            : OPTIONS.looked_at
+            : Options.looked_at
         ]:
             formula = self._formula(match)
             if found.setdefault(formula.kind, formula).left > formula.left:
@@ -323,25 +318,25 @@ class NoisyTextbook:
         gradient, hessian = family.gradient_and_hessian(c, self._weak.states)
         found = self._weak.deviations(hessian)
         off = np.abs(self._weak.average(gradient) - self._weak.target) / found
-        return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / OPTIONS.far)
+        return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / Options.far)
 
     def _matches(self, products: bool) -> list[Match]:
         setting = self._setting
         dictionary = setting.dictionary(products=products)
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         matching = Matching(
-            setting, self._target, OPTIONS.penalty / (len(self._target) * np.log(2))
+            setting, self._target, Options.penalty / (len(self._target) * np.log(2))
         )
-        found = matching.best(dictionary, OPTIONS.atoms)
+        found = matching.best(dictionary, Options.atoms)
         if not products:
             most = len(self._target) / 4 - len(setting.base)
             blocks = [*setting.blocks(), *setting.turning()]
             found += [matching.refined(b) for b in blocks if len(b) < most]
-        likeliest = sorted(found, key=self._length_of_match)[: OPTIONS.exchanged]
+        likeliest = sorted(found, key=self._length_of_match)[: Options.exchanged]
         return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
 
     def _length_of_match(self, match: Match) -> float:
-        return len(self._target) * np.log(match.left) + OPTIONS.penalty * match.complexity
+        return len(self._target) * np.log(match.left) + Options.penalty * match.complexity
 
     def _formula(self, match: Match) -> Formula:
         """The law of a match, without the coordinates and products that it does not ask for."""
@@ -349,7 +344,7 @@ class NoisyTextbook:
         whole = Formula(self._setting, atoms, np.zeros(len(atoms)), np.inf, len(self._target))
         columns, nothing = self._setting.columns(self._setting.terms(atoms)), whole.coefficients
         triangle = Triangle.of(np.column_stack([columns, -self._target]))
-        kept, c = significant(triangle, nothing, OPTIONS.kept)
+        kept, c = significant(triangle, nothing, Options.kept)
         if not len(kept):  # none stands out
             kept, c = significant(triangle, nothing, 0.0)
         left = np.linalg.norm(columns[:, kept] @ c - self._target)

@@ -8,7 +8,6 @@ factor of about (ωh)² a time; others stall. That is how the right one is told 
 the corrected gradients of the law that came closest are what the next round of matching is given.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -28,8 +27,7 @@ from gfnn_jax.phase_space import apply_j
 _STEPS = Steps(6, 1)
 
 
-@dataclasses.dataclass(frozen=True)
-class TextbookOptions:
+class Options:
     """Tuned on the laws of benchmarks/textbook.py.
 
     rows: pairs that are looked at; quiet: the part of them that move least, which is used: their
@@ -70,9 +68,6 @@ class TextbookOptions:
     as_well: float = 1e3
 
 
-OPTIONS = TextbookOptions()
-
-
 class Law(NamedTuple):
     """A family of terms of H, and forces where there are such, their coefficients, and the RMS of
     Φ(z₀) − z₁ ÷ scale."""
@@ -94,7 +89,7 @@ class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
     angles, cyclic: indices of z. forces: of `Setting`. Raises ValueError for more degrees of
-    freedom than ``OPTIONS.most_dim``.
+    freedom than ``Options.most_dim``.
     """
 
     def __init__(
@@ -108,12 +103,12 @@ class Textbook:
         on_progress: Callable[[str], Any] = lambda message: None,
     ):
         dim = problem.z0.shape[1] // 2
-        if dim > OPTIONS.most_dim:
-            raise ValueError(f"expected at most {OPTIONS.most_dim} degrees of freedom, got {dim}")
+        if dim > Options.most_dim:
+            raise ValueError(f"expected at most {Options.most_dim} degrees of freedom, got {dim}")
         self._problem, self._on_progress = problem, on_progress
-        rows = np.asarray(rows[: OPTIONS.rows])
+        rows = np.asarray(rows[: Options.rows])
         moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
-        self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(OPTIONS.quiet * len(rows)))]])
+        self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(Options.quiet * len(rows)))]])
         z0, self._z1 = problem.z0[self._rows], problem.z1[self._rows]
         dt = of_lanes(problem.dt, self._rows)
         self._h = dt[:, None] if np.ndim(dt) else dt
@@ -176,14 +171,14 @@ class Textbook:
             if not self._certain(gains, len(dictionary.atoms)):
                 return None  # what is left over is noise
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
-        most = self._middle.size / OPTIONS.rows_per_term - len(self._setting.base)
+        most = self._middle.size / Options.rows_per_term - len(self._setting.base)
         blocks = [b for b in blocks if len(b) < most]
         target, last = self._target, np.inf
-        for _ in range(OPTIONS.rounds):
+        for _ in range(Options.rounds):
             matching = self._matching(target)
             # The best matches, and plainer ones that leave hardly more.
-            best = matching.best(dictionary, OPTIONS.atoms, starts)[: OPTIONS.finalists]
-            plainer = [matching.plainer(m, dictionary) for m in best[: OPTIONS.plainer]]
+            best = matching.best(dictionary, Options.atoms, starts)[: Options.finalists]
+            plainer = [matching.plainer(m, dictionary) for m in best[: Options.plainer]]
             tried = list({m.atoms: m for m in [*plainer, *best]}.values())
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
@@ -195,7 +190,7 @@ class Textbook:
                 return None
             self._partial += states
             closest = min(states, key=lambda s: s.law.left)
-            if not closest.law.left < OPTIONS.contracted * last:
+            if not closest.law.left < Options.contracted * last:
                 break
             target, last, self._closest = closest.target, closest.law.left, closest
         return None
@@ -203,34 +198,34 @@ class Textbook:
     def _without_spare(self, state: _State) -> _State:
         """The law without the atoms that it does not need, where it leaves roundoff: beside spare
         atoms no law is told from an approximation, because no residual is below roundoff."""
-        if state.law.left > OPTIONS.roundoff or self._is_exact(state):
+        if state.law.left > Options.roundoff or self._is_exact(state):
             return state
-        return self._simpler(state, 3 * OPTIONS.roundoff)
+        return self._simpler(state, 3 * Options.roundoff)
 
     def _is_exact(self, state: _State) -> bool:
         """Return whether the law is as exact as no approximation of so many numbers would be."""
         atoms = state.match.atoms
         if None not in map(self._setting.powers, atoms):
-            return state.law.left <= OPTIONS.roundoff
+            return state.law.left <= Options.roundoff
         numbers = len(atoms) + sum(len(constants_of(a)) for a in atoms)
-        digits = OPTIONS.digits + OPTIONS.digits_a_number * numbers
+        digits = Options.digits + Options.digits_a_number * numbers
         return state.law.left <= 10.0**-digits
 
     def _certain(self, gains: np.ndarray, tried: int) -> bool:
         """Return whether the largest gain of so many atoms tried is no chance."""
         gain = min(gains.max(initial=0.0), 1 - 1e-12)
-        chance = 2 * np.log(tried) + OPTIONS.certain
+        chance = 2 * np.log(tried) + Options.certain
         return bool(-self._middle.size * np.log1p(-gain) >= chance)
 
     def _converged(self, match: Match, target: np.ndarray) -> _State | None:
         """The match with coefficients and constants as far as corrections lead; None where its
         flow fails."""
         best = None
-        for _ in range(OPTIONS.corrections):
+        for _ in range(Options.corrections):
             found = self._corrected(match, target)
             if found is None:
                 return best
-            if best is not None and not found.law.left < OPTIONS.contracted * best.law.left:
+            if best is not None and not found.law.left < Options.contracted * best.law.left:
                 return best if best.law.left <= found.law.left else found
             best, target = found, found.target
             match = self._matching(target).refined(match.atoms)
@@ -254,7 +249,7 @@ class Textbook:
         images = self._problem.images(family, c, self._rows, _STEPS).states
         off = (images - self._z1) / self._problem.scale
         known = np.isfinite(off).all(axis=1)
-        if np.mean(~known) > OPTIONS.lost:
+        if np.mean(~known) > Options.lost:
             return None
         corrected = family.gradient(c, self._middle) - apply_j(self._z1 - images) / self._h
         corrected = np.where(known[:, None], corrected, target)
@@ -265,7 +260,7 @@ class Textbook:
     def _simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
-        bound, most = 3 * max(state.law.left, OPTIONS.roundoff), min(3, len(state.match.atoms))
+        bound, most = 3 * max(state.law.left, Options.roundoff), min(3, len(state.match.atoms))
         others = self._matching(state.target).best(self._setting.dictionary(), most)
         return self._rounded(self._simpler(state, bound, others), bound)
 
@@ -281,7 +276,7 @@ class Textbook:
                     yield self._matching(state.target).refined(atoms)
 
         def changed(state: _State, match: Match) -> _State | None:
-            as_well = match.left <= OPTIONS.as_well * max(state.match.left, OPTIONS.matched)
+            as_well = match.left <= Options.as_well * max(state.match.left, Options.matched)
             simpler = match.complexity < state.match.complexity
             found = self._converged(match, state.target) if as_well and simpler else None
             return found if found is not None and found.law.left <= bound else None
@@ -307,11 +302,11 @@ class Textbook:
 
 def _of_few_digits(constant: float) -> Iterator[float]:
     """Numbers near the constant, those of fewest digits first."""
-    if abs(constant) < OPTIONS.rounded:
+    if abs(constant) < Options.rounded:
         yield 0.0
-    for digits in OPTIONS.shown:
+    for digits in Options.shown:
         rounded = float(f"{constant:.{digits}g}")
-        if abs(rounded - constant) <= OPTIONS.rounded * abs(constant):
+        if abs(rounded - constant) <= Options.rounded * abs(constant):
             yield rounded
 
 
