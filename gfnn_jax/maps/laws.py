@@ -82,17 +82,10 @@ def map_of_law(
     steps = _steps(flow, z[some], own, tolerance, stiffness(one, split(z[some])[0], u))
     flow = dataclasses.replace(flow, **dataclasses.asdict(steps))
     posterior = None if root is None else Posterior(0, np.asarray(root))
-    return SymplecticMap(
-        (flow,),
-        coordinates,
-        covering(z, ignore=whole),
-        scale,
-        centre,
-        float(dt),
-        parameters=sampled(parameters, args) if parameters else None,
-        posterior=posterior,
-        signals=signals,
-    )
+    more: dict[str, Any] = {"posterior": posterior, "signals": signals}
+    more["parameters"] = sampled(parameters, args) if parameters else None
+    domain = covering(z, ignore=whole)
+    return SymplecticMap((flow,), coordinates, domain, scale, centre, float(dt), **more)
 
 
 def smoothed(law: Lagrangian, width: float) -> Lagrangian:

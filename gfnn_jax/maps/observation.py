@@ -732,14 +732,8 @@ def observed(
             f"guess: no parameter {', '.join(unknown)} among {', '.join(parameters) or 'none'}"
         )
     values = np.array([starts.get(name, np.nan) for name in parameters])
-    found = Observation(
-        tuple(formulas),
-        tuple(formulas.values()),
-        tuple(coordinates),
-        tuple(speeds),
-        tuple(parameters),
-        values,
-    )
+    named = tuple(coordinates), tuple(speeds), tuple(parameters)
+    found = Observation(tuple(formulas), tuple(formulas.values()), *named, values)
     return dataclasses.replace(found, values=_started(found))
 
 

@@ -232,13 +232,8 @@ class SymplecticMap:
         dt_range = None
         if self.dt_range is not None or other.dt_range is not None:
             dt_range = sum(m.dt if m.dt_range is None else m.dt_range for m in (self, other))
-        return dataclasses.replace(
-            self,
-            pieces=(*self.pieces, *other.pieces),
-            dt=self.dt + other.dt,
-            parameters=ours,
-            dt_range=dt_range,
-        )
+        pieces, dt = (*self.pieces, *other.pieces), self.dt + other.dt
+        return dataclasses.replace(self, pieces=pieces, dt=dt, parameters=ours, dt_range=dt_range)
 
     def reversed(self) -> SymplecticMap:
         """Make the inverse map."""

@@ -4,11 +4,8 @@ from typing import Any, NamedTuple
 
 OK, LEFT_DOMAIN, STOPPED_AT_EDGE, NOT_CONVERGED, NON_FINITE = range(5)
 STATUS_NAMES = (
-    "ok",
-    "left the domain",
-    "stopped at the domain's edge",
-    "not converged",
-    "non-finite",
+    *("ok", "left the domain", "stopped at the domain's edge"),
+    *("not converged", "non-finite"),
 )
 
 

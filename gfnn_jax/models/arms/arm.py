@@ -127,16 +127,9 @@ class Arm:
         map_ = map_of_arm(found, states, dt, recording.inputs, gains)
         spread = np.std(np.nan_to_num(motion.force), axis=0) + 1e-300
         shares = np.where(motion.heard, 1 - (found.residual / spread) ** 2, 0.0)
-        return LearnedArm(
-            map_,
-            base,
-            found,
-            dict(zip(names, found.residual, strict=True)),
-            dict(zip(names, shares, strict=True)),
-            tuple(notes),
-            swing,
-            len(recording),
-        )
+        left, explained = (dict(zip(names, x, strict=True)) for x in (found.residual, shares))
+        count = len(recording)
+        return LearnedArm(map_, base, found, left, explained, tuple(notes), swing, count)
 
     def _gains(self, names: Sequence[str]) -> np.ndarray:
         """Force of each joint for a unit of its input, (k,)."""

@@ -91,15 +91,9 @@ def from_dh(
 
 def _chain(turns, origins, axes, sliding, gravity) -> Kinematics:
     count = len(axes)
-    bodies = Bodies(
-        tuple(f"q{i + 1}" for i in range(count)),
-        tuple(range(BASE, count - 1)),
-        tuple(i in set(sliding) for i in range(count)),
-        turns,
-        origins,
-        axes,
-        np.array(gravity, float),
-    )
+    names, parents = tuple(f"q{i + 1}" for i in range(count)), tuple(range(BASE, count - 1))
+    slides = tuple(i in set(sliding) for i in range(count))
+    bodies = Bodies(names, parents, slides, turns, origins, axes, np.array(gravity, float))
     ends = [*origins[1:], np.zeros(3)]
     own = np.linalg.norm(ends, axis=1)
     usual = np.mean(own[own > 0]) if np.any(own > 0) else LONE
@@ -150,15 +144,11 @@ def from_urdf(path: Any, gravity: Sequence[float] = EARTH) -> Kinematics:
     if not rows:
         raise InputError(f"{path}: expected joints that move, found none")
     moving, parents, frames, axes, prior = zip(*rows, strict=True)
-    bodies = Bodies(
-        tuple(joint.name for joint in moving),
-        parents,
-        tuple(joint.type == "prismatic" for joint in moving),
-        np.array([frame[:3, :3] for frame in frames]),
-        np.array([frame[:3, 3] for frame in frames]),
-        np.array(axes),
-        np.array(gravity, float),
-    )
+    names = tuple(joint.name for joint in moving)
+    slides = tuple(joint.type == "prismatic" for joint in moving)
+    turns, origins = (np.array([frame[:3, k] for frame in frames]) for k in (slice(3), 3))
+    down = np.array(gravity, float)
+    bodies = Bodies(names, parents, slides, turns, origins, np.array(axes), down)
     efforts = [joint.limit.effort if joint.limit else None for joint in moving]
     limits = np.array([effort or np.inf for effort in efforts])
     prior = np.array(prior)

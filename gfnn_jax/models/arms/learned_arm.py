@@ -184,13 +184,5 @@ def map_of_arm(
     piece = Flow(family, params, dt, scale, _STAGES, substeps, bool(rate > _STIFFEST))
     root = np.zeros((len(found.x), len(params)))
     root[:, : len(found.x)] = covariance_root(found.covariance[None])[0]
-    return SymplecticMap(
-        (piece,),
-        CARTESIAN,
-        covering(z),
-        scale,
-        np.zeros(0),
-        dt,
-        posterior=Posterior(0, root),
-        signals=Signals(tuple(inputs)),
-    )
+    more: dict[str, Any] = {"posterior": Posterior(0, root), "signals": Signals(tuple(inputs))}
+    return SymplecticMap((piece,), CARTESIAN, covering(z), scale, np.zeros(0), dt, **more)

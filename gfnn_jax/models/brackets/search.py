@@ -416,15 +416,9 @@ def _of_populations(train: Data, held: Data, names, sigma, error: float) -> Pois
     for _, own, sigma in sorted(tried, key=lambda one: one[0]):
         if not own.field.library.gradient(own.c, z).any(axis=0).all():
             continue  # one of the populations would never change
-        law = PoissonLaw(
-            own.field,
-            FieldFit(own.c, np.zeros(0), np.nan, own.root, 0, own.field),
-            error_on(own.field, own.c, held),
-            bracket.name,
-            (),
-            own.sigma,
-            relative=sigma is relative,
-        )
+        fit = FieldFit(own.c, np.zeros(0), np.nan, own.root, 0, own.field)
+        fits = own.field, fit, error_on(own.field, own.c, held)
+        law = PoissonLaw(*fits, bracket.name, (), own.sigma, relative=sigma is relative)
         left = law.noise_of(train.z0)
         part = float(np.mean(np.sqrt(np.mean(left**2, axis=0)) / train.spread))
         law = law._replace(fit=law.fit._replace(residual=left, relative=part))

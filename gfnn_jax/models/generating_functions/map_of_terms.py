@@ -177,14 +177,9 @@ class SumOfTerms:
             return
         features = scene.features if scene is not None else None
         states, functions = states_and_functions(data, data.training, features=features)
-        yield from walked(
-            states,
-            functions,
-            attempt,
-            lambda tried: tried.error.bound,
-            bound=tolerance.bound,
-            most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, Options.most_terms),
-        )
+        most = min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, Options.most_terms)
+        given, limits = (states, functions, attempt), {"bound": tolerance.bound, "most": most}
+        yield from walked(*given, lambda tried: tried.error.bound, **limits)
 
 
 def _work(family: Any, data: Dataset) -> float:

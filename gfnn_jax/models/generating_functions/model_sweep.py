@@ -127,16 +127,6 @@ def training_data(data: Dataset, rows: np.ndarray) -> TrainingData:
     """Data of these rows that a model is given."""
     dt, args = data.given(rows)
     coordinates, pairs = data.coordinates, data.pairs.take(rows)
-    return TrainingData(
-        data.y0[rows],
-        data.y1[rows],
-        dt,
-        args,
-        data.parameters,
-        data.scale,
-        coordinates.angles,
-        coordinates.cyclic,
-        pairs.run,
-        pairs.place,
-        pairs.std,
-    )
+    states, about = (data.y0[rows], data.y1[rows]), (dt, args, data.parameters, data.scale)
+    kinds, own = (coordinates.angles, coordinates.cyclic), (pairs.run, pairs.place, pairs.std)
+    return TrainingData(*states, *about, *kinds, *own)

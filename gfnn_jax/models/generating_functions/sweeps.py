@@ -104,13 +104,8 @@ class Options:
     # Degrees whose numbers of terms grow by about a half from one to the next; those of a group
     # are estimated from one factor of the rows of its largest.
     degrees: tuple[tuple[int, ...], ...] = (
-        (2, 3),
-        (4, 5, 6),
-        (7, 8),
-        (9, 10),
-        (12, 14),
-        (16, 18, 20),
-        (24, 28, 32),
+        *((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14)),
+        *((16, 18, 20), (24, 28, 32)),
     )
     trial: tuple[int, ...] = (2, 3, 4, 5, 6)
     sines: tuple[int, ...] = (100, 200, 400, 800, 1_600)
@@ -310,13 +305,8 @@ class LinearSweep(Generates):
             ((_, outside),) = least_squares.residuals(
                 factors.inner, factors.outer, [size.family.num_parameters]
             )
-        candidate = dataclasses.replace(
-            estimated,
-            train_rms=solved.train_rms,
-            condition=solved.condition,
-            rank=solved.rank,
-            outside=outside,
-        )
+        told = {name: getattr(solved, name) for name in ("train_rms", "condition", "rank")}
+        candidate = dataclasses.replace(estimated, outside=outside, **told)
         candidate = validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
         seconds = estimated.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
@@ -486,14 +476,9 @@ class LinearSweep(Generates):
             states = (residual, *self.by_states(family, params, w, *args), goes_on)
         scores = uncertainty.scores(slopes, *states) if states and goes_on.any() else None
         noise = self._noise(size, larger, data, states) if larger is not None else None
-        return uncertainty.root(
-            train,
-            family.num_parameters,
-            (slopes.reshape(-1, family.num_parameters), residual.ravel()),
-            noise=noise,
-            ridge=solved.ridge,
-            scores=scores,
-        )
+        count, ridge = family.num_parameters, solved.ridge
+        parts = slopes.reshape(-1, count), residual.ravel()
+        return uncertainty.root(train, count, parts, noise=noise, ridge=ridge, scores=scores)
 
     def error_by_noise(self, size: Size) -> float:
         """Error of the size's ∇S by noise, in the measure of train_rms: half of the

@@ -121,19 +121,9 @@ def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace
             before, after = (law.terms.potentials(x, 0, u).value for x in (q[:-1], q[1:]))
             raised = own.coefficients * (after - before)
             supplied += raised @ law.terms.first_inputs(law.num_inputs)
-        found.append(
-            Trace(
-                stretch.run,
-                t,
-                y / factors,
-                (y - left[k, :n]) / factors,
-                fit.fitted.residuals[k, :n],
-                read,
-                own.energy(q, v),
-                _summed(lost),
-                _summed(supplied),
-            )
-        )
+        read_as = y / factors, (y - left[k, :n]) / factors, fit.fitted.residuals[k, :n], read
+        energies = own.energy(q, v), _summed(lost), _summed(supplied)
+        found.append(Trace(stretch.run, t, *read_as, *energies))
     return tuple(found)
 
 
@@ -543,15 +533,9 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     """
     names = recording.coordinates
     angles = tuple(i for i, name in enumerate(names) if name in recording.angles)
-    observation = observed(
-        recording.observe,
-        names,
-        speed_names(names, recording.velocities),
-        recording.guess,
-        offsets=recording.offsets,
-        scales=recording.scales,
-        columns=recording.columns,
-    )
+    own = {name: getattr(recording, name) for name in ("offsets", "scales", "columns")}
+    speeds = speed_names(names, recording.velocities)
+    observation = observed(recording.observe, names, speeds, recording.guess, **own)
     unseen = [names[i] for i in observation.hidden_places()] if recording.observe else []
     if unseen and observation.hidden is None:
         raise InputError(
@@ -631,17 +615,10 @@ def samples_of(
             f"its motion changes, about {scales.period:.3g} s",
             verdict="no law: the motion hardly changes in the recording",
         )
-    problem = ArcProblem(
-        nodes,
-        scales,
-        observation,
-        angles,
-        parameters=parameters,
-        options=options,
-        on_progress=on_progress,
-        forces=(*recording.inputs, *INPUTS[len(recording.inputs) :]),
-        units=tuple(recording.units.get(name, "") for name in observation.coordinates),
-    )
+    about: dict[str, Any] = {"parameters": parameters, "options": options}
+    about |= {"forces": (*recording.inputs, *INPUTS[len(recording.inputs) :])}
+    about["units"] = tuple(recording.units.get(name, "") for name in observation.coordinates)
+    problem = ArcProblem(nodes, scales, observation, angles, on_progress=on_progress, **about)
     return RecordingData(recording, problem, found, messages=messages)
 
 
@@ -694,13 +671,8 @@ def _found(
         find = search_of_systems
     found = find(problem)
     if found is None:
-        alike = samples_of(
-            data.recording,
-            problem.observation.loss,
-            options=problem.options,
-            on_progress=problem.on_progress,
-            differ=False,
-        )
+        own: dict[str, Any] = {"options": problem.options, "on_progress": problem.on_progress}
+        alike = samples_of(data.recording, problem.observation.loss, differ=False, **own)
         return _found(dataclasses.replace(alike, mass=data.mass), terms, rules)
     again = choose_again(found.model, rules, problem.length(1.0))
     if again.hold != found.model.hold:

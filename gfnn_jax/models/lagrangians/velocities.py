@@ -113,14 +113,9 @@ def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
         chance = Options.chance / np.sqrt(finite.sum())
         white = _colour(left) < max(Options.coloured, chance) and not _copied(recording, i, name)
         allowed = max(Options.wrong, chance * np.sqrt(3 * tau))
-        found[name] = Velocity(
-            (1 + float(beta[0]), float(error[0])),
-            (-float(beta[1]), float(error[1])),
-            (float(beta[2]), float(error[2])),
-            sigma,
-            bool(white),
-            bool(white and share < allowed),
-        )
+        scale, late = (1 + float(beta[0]), float(error[0])), (-float(beta[1]), float(error[1]))
+        off, used = (float(beta[2]), float(error[2])), bool(white and share < allowed)
+        found[name] = Velocity(scale, late, off, sigma, bool(white), used)
     return found
 
 

@@ -239,14 +239,8 @@ def map_of(
         inputs = partial(box_inputs, angles=triples.angles)
         fitted = fit_predictors(TYPE1, before, middle, triples.dt, inputs)
         piece = dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
-    map_ = SymplecticMap(
-        pieces=(piece,),
-        coordinates=Coordinates("positions", tuple(angles)),
-        domain=domain,
-        scale=sizes(before),
-        angle_centre=np.array(centres),
-        dt=triples.dt,
-    )
+    where = Coordinates("positions", tuple(angles)), domain, sizes(before), np.array(centres)
+    map_ = SymplecticMap((piece,), *where, triples.dt)
     map_ = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
     map_ = dataclasses.replace(map_, posterior=Posterior(0, factor * root), sensors=sensors)
     return map_, Pairs(before, middle, triples.dt)

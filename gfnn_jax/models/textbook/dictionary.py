@@ -40,11 +40,8 @@ class Options:
     centres: tuple[tuple[int, int], ...] = ((2, 15), (3, 9))
     wider: float = 1.2
     central: tuple[Kind, ...] = (
-        ("power", -1.0),
-        ("power", -2.0),
-        ("power", -3.0),
-        ("power", 1.0),
-        ("log", 0.0),
+        *(("power", -1.0), ("power", -2.0), ("power", -3.0)),
+        *(("power", 1.0), ("log", 0.0)),
     )
 
 

@@ -134,14 +134,8 @@ def weak_gradients(
     used, place = np.unique(own, return_inverse=True)
     rate = np.einsum("w,rwi->ri", slope, whole[own])
     deviation = np.roll(noise, len(noise) // 2) * np.linalg.norm(slope)
-    return WeakGradients(
-        np.concatenate(states)[used],
-        np.concatenate(noises)[used],
-        -apply_j(rate),
-        deviation,
-        place.reshape(own.shape),
-        bump,
-    )
+    at = np.concatenate(states)[used], np.concatenate(noises)[used]
+    return WeakGradients(*at, -apply_j(rate), deviation, place.reshape(own.shape), bump)
 
 
 def gradients_of_pairs(
