@@ -54,9 +54,10 @@ def test_a_flow_that_fails_is_nan():
 def smaller(monkeypatch, name, recipe, **sizes):
     """The method of this name, with another recipe and other sizes where it has these."""
     module = sys.modules[METHODS[name].learn.__module__]
-    own = {size: value for size, value in sizes.items() if hasattr(module._OPTIONS, size)}
     monkeypatch.setattr(module, "Recipe", lambda *args, **options: recipe)
-    monkeypatch.setattr(module, "_OPTIONS", dataclasses.replace(module._OPTIONS, **own))
+    for size, value in sizes.items():
+        if hasattr(module._Options, size):
+            monkeypatch.setattr(module._Options, size, value)
     return METHODS[name]
 
 
