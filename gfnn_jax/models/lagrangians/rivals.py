@@ -56,7 +56,8 @@ class Options:
 
     most: powers of the distance to either side. series: potentials, from which on they may be the
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
-    finer: between half and twice the best of them; apart: relative, over which it is
+    finer: between half and twice the best of them; near: of what the best shape leaves of the
+    equations of motion, above which another is not fitted; apart: relative, over which it is
     differentiated; imitated: share of what it changes that no coefficient does, below which it is
     not known; corrections: of it; furthest: relative, of each; settled: standard errors,
     within which it is found. noise: times it, that is no more;
@@ -71,6 +72,7 @@ class Options:
     series: int = 3
     constants: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
     finer: int = 9
+    near: float = 4.0
     apart: float = 1e-4
     imitated: float = 1e-4
     corrections: int = 6
@@ -214,9 +216,14 @@ def with_a_shape(fit: LawFit) -> LawFit:
     shapes = product(GAINS if driven else SHAPES, lengths)
     begun = {one: tried.nearest(*one) for one in shapes}
     (_, length), _ = min(begun.items(), key=lambda one: one[1][1])
-    found = [(fit.criterion(), "", fit)]
-    for (name, along), (near, _) in begun.items():
-        other = tried.fitted(name, along, near) if along == length else None
+    close = [
+        (name, *tried.closer(name, length, near))
+        for (name, along), (near, _) in begun.items()
+        if along == length
+    ]
+    found, most = [(fit.criterion(), "", fit)], Options.near * min(left for *_, left in close)
+    for name, constant, left in close:
+        other = tried.fitted(name, length, constant) if left <= most else None
         if other is not None:
             found.append((other.criterion(fit.independent) + np.log(fit.independent), name, other))
     least = min(cost for cost, _, _ in found) + fit.problem.options.evidence.deciding
@@ -262,26 +269,30 @@ class _Shapes:
         tried = {a: self.left(name, along, a) for a in (*sizes, *-sizes)}
         return min(tried.items(), key=lambda one: one[1])
 
-    def fitted(self, name: str, along: Sequence[int], near: float) -> LawFit | None:
-        """The fit with the constant that is likeliest near this one, without the plain terms that
-        are not likely; None where no orbit follows."""
+    def closer(self, name: str, along: Sequence[int], near: float) -> tuple[float, float]:
+        """The constant near this one that leaves least, and what it leaves."""
         finer = near * np.geomspace(0.5, 2.0, Options.finer)  # beyond some a shape may be singular
         at = int(np.argmin([self.left(name, along, a) for a in finer]))
         ends = sorted(finer[[max(at - 1, 0), min(at + 1, len(finer) - 1)]])
         left = partial(self.left, name, along)
         least_at: Any = minimize_scalar(left, bounds=ends, method="bounded")
-        structure = self.structure(name, along, float(least_at.x))
+        return float(least_at.x), float(least_at.fun)
+
+    def fitted(self, name: str, along: Sequence[int], constant: float) -> LawFit | None:
+        """The fit with the likeliest constant from this one on, without the plain terms that are
+        not likely; None where no orbit follows."""
+        structure = self.structure(name, along, constant)
         structure, known = weak_start(structure, self.fit.problem, False)
         fit = with_constant(self.fit.again(structure, known, rescale=False), False)
         if not (fit.follows and fit.is_definite):
             return None
         free = [("term", row) for row in self.plain]
-        constant = {key for key in free if sum(key[1][1]) == 1}  # pull and are pulled: a pair
+        pulls = {key for key in free if sum(key[1][1]) == 1}  # pull and are pulled: a pair
 
         def least_seen(fit: LawFit) -> list[frozenset[Key]]:
             z = fit.significance
             own = sorted((key for key in free if key in z), key=lambda key: z[key])
-            return [frozenset({key}) for key in own] + [frozenset(constant & set(own))]
+            return [frozenset({key}) for key in own] + [frozenset(pulls & set(own))]
 
         def without(fit: LawFit, keys: frozenset[Key]) -> LawFit | None:
             smaller = fit.structure.without(set(keys))
