@@ -51,7 +51,7 @@ OLD = "f45649e9^"  # before laws were followed by compiled code
 LANES = (1, 768)
 RECORDS = {"pendulum": 60.0, "two_carts": 6.0, "double_pendulum": 3.53}  # seconds of each
 # record of a user's folder -> what its columns are, where these do not say so
-OF_FOLDER: dict[str, dict[str, list[str]]] = {
+OF_FOLDER: dict[str, dict[str, Any]] = {
     "arm1": {},
     "arm3": {},
     "silverbox": {"inputs": ["u"], "positions": ["y"]},
