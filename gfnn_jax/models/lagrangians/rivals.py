@@ -258,9 +258,13 @@ class _Shapes:
         return dataclasses.replace(self.fit.structure, terms=tuple(dict.fromkeys(terms)))
 
     def left(self, name: str, along: Sequence[int], constant: float) -> float:
-        """Share of the squares of the equations of motion that it leaves."""
-        equal = len(along) == 1
-        return weak_share(self.structure(name, along, constant), self.fit.problem, equal)
+        """Share of the squares of the equations of motion that it leaves; infinite where it
+        overflows."""
+        with contextlib.suppress(np.linalg.LinAlgError):
+            structure = self.structure(name, along, constant)
+            share = weak_share(structure, self.fit.problem, len(along) == 1)
+            return share if np.isfinite(share) else np.inf
+        return np.inf
 
     def nearest(self, name: str, along: Sequence[int]) -> tuple[float, float]:
         """The constant of a few that leaves least, and what it leaves."""
@@ -282,7 +286,10 @@ class _Shapes:
         """The fit with the likeliest constant from this one on, without the plain terms that are
         not likely; None where no orbit follows."""
         structure = self.structure(name, along, constant)
-        structure, known = weak_start(structure, self.fit.problem, False)
+        try:
+            structure, known = weak_start(structure, self.fit.problem, False)
+        except (FitError, np.linalg.LinAlgError):
+            return None
         fit = with_constant(self.fit.again(structure, known, rescale=False), False)
         if not (fit.follows and fit.is_definite):
             return None
@@ -292,7 +299,8 @@ class _Shapes:
         def least_seen(fit: LawFit) -> list[frozenset[Key]]:
             z = fit.significance
             own = sorted((key for key in free if key in z), key=lambda key: z[key])
-            return [frozenset({key}) for key in own] + [frozenset(pulls & set(own))]
+            pair = frozenset(pulls & set(own))
+            return [frozenset({key}) for key in own] + [pair] * (len(pair) > 1)
 
         def without(fit: LawFit, keys: frozenset[Key]) -> LawFit | None:
             smaller = fit.structure.without(set(keys))
