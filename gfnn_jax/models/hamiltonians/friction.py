@@ -268,9 +268,10 @@ def followed(
     return _replaced(family, wide), max(substeps, 1), tuple(map(float, widths[dry]))
 
 
-def kinds_of_friction(problem: LawProblem, law: FittedLaw, steps: Steps) -> WhichFriction | None:
-    """The kinds that a law has, with odds where these were found, and upper limits of the others;
-    None of a law with parameters or of many sites, and in coordinates other than the user's."""
+def kinds_of_friction(problem: LawProblem, law: FittedLaw) -> WhichFriction | None:
+    """The kinds that a law has, with odds where these were found, and upper limits of the others by
+    the steps of its fit: those of a map err by up to its tolerance. None of a law with parameters
+    or of many sites, and in coordinates other than the user's."""
     data, family, coefficients = problem.data, law.family, law.fit.coefficients
     own, taken = without_forces(family), _rows_of(family)
     plain = data.coordinates.forward is CARTESIAN.forward
@@ -288,7 +289,7 @@ def kinds_of_friction(problem: LawProblem, law: FittedLaw, steps: Steps) -> Whic
     larger = Uniform(larger) if isinstance(family, Uniform) else larger
     limits: dict[Loss, float] = {}
     if len(rows) * data.dim > len(c):
-        table = _table(problem.flows, larger, c, steps, rows)
+        table = _table(problem.flows, larger, c, law.fit.steps, rows)
         limits = {} if table is None else table.limits(taken)
     sharp = {(c, kind, 0.0): limit for (c, kind, _), limit in limits.items()}
     choice = FrictionChoice(taken, law.odds or {}, sharp, gains=False)

@@ -254,7 +254,7 @@ def learned_from(
         rivals=found.rivals,
         widths=widths,
         turns=turns and problem.met_by(found) and error.bound > problem.tolerance.bound,
-        kinds=partial(kinds_of_friction, problem, found, own_steps),
+        kinds=partial(kinds_of_friction, problem, found),
     )
     messages = _messages(problem, found, law, turns, int(unresolved.sum()))
     return dataclasses.replace(
