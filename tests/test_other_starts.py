@@ -84,6 +84,52 @@ def test_a_term_stays_without_which_the_fit_does_not_converge(converges, monkeyp
     assert len(pruned.structure.terms) == (2 if converges else 3)
 
 
+def two_bodies(seed, coupled=0.0):
+    """Two runs of two bodies between springs, with friction, whose places are read in whole units
+    from zeros anywhere that wander a little; and twice the matrix of T. coupled: mass between the
+    bodies, with springs beside which no other masses are both above zero without it."""
+    rng = np.random.default_rng(seed)
+    second, ends, between = rng.uniform(1.5, 3.5), rng.uniform(20, 60, 2), rng.uniform(50, 100)
+    mass = np.diag([1.0, second]) + coupled * (1 - np.eye(2))
+    spring = np.diag(ends + between) - between * (1 - np.eye(2))
+    if coupled:  # V₁₂/T₁₂ lies between V₁₁/T₁₁ and V₂₂/T₂₂
+        spring = np.array([[30.0, 20.0], [20.0, 20.0 * second]])
+    solved, rub, t = (
+        np.linalg.solve(mass, spring),
+        10 ** rng.uniform(-2.2, -1.6),
+        np.arange(98) / 30,
+    )
+    zero, runs = rng.uniform(-250, 250, 2), []
+    for _ in range(2):
+        start = [*rng.uniform(-110, 110, 2), 0, 0]
+        q = motion(lambda q, v: -solved @ q - rub * v, start, t).T
+        noise = rng.normal(size=(98, 2)) * [0.45, 0.35]
+        wander, kept = 0.33 * rng.normal(size=(98, 2)), np.exp(-1 / 30 / 0.18)
+        for k in range(1, 98):
+            wander[k] = kept * wander[k - 1] + np.sqrt(1 - kept**2) * wander[k]
+        x = np.round(zero + q + noise + wander)
+        runs.append({"t": t, "x1": x[:, 0], "x2": x[:, 1]})
+    return gfnn.Recording(runs, positions=["x1", "x2"]), mass
+
+
+def masses_of(fit):
+    """Speeds of a constant mass -> its coefficient."""
+    return {k[1][0]: c for k, c in fit.values.items() if k[0] == "term" and any(k[1][0])}
+
+
+@pytest.mark.slow
+def test_masses_that_springs_make_up_for_couple_no_bodies():
+    """Linear motion has many masses, each with springs to suit: the bodies' own are found. Those
+    that only masses between them explain stay."""
+    for seed in range(6):
+        recording, mass = two_bodies(seed)
+        masses = masses_of(best_start(samples_of(recording).problem))
+        assert (1, 1) not in masses
+        assert masses[0, 2] == pytest.approx(mass[1, 1] / 2, rel=0.1)
+    recording, _ = two_bodies(0, coupled=0.8)
+    assert (1, 1) in masses_of(best_start(samples_of(recording).problem))
+
+
 @pytest.mark.slow
 def test_a_trap_whose_axes_are_not_coupled_has_its_law():
     trap = recorded(lambda q, v: -np.array([1.0, 2.3]) * q - 0.01 * v, [1, 0.7, 0, 0], ["x", "y"])

@@ -115,7 +115,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     if problem.observation.crossed and some.fits:  # times of one event tell no more
         return some.fits[0]
     if any(not fit.is_definite for fit in some.fits):  # as products of speeds may make it
-        apart = [row for row in textbook.rows if max(row[0]) != 1 or not is_constant(row)]
+        apart = [row for row in textbook.rows if not _couples(row)]
         some.add(_Library(apart))
     many = d > libraries.FEW  # whose larger libraries take long
     if many:
@@ -166,7 +166,8 @@ def best_start(problem: ArcProblem) -> LawFit:
             some.add(led._replace(leaders=leaders))
     if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
-    return some.best_along(some.likeliest() if some.least < OPTIONS.white else some.plainest())
+    taken = some.likeliest() if some.least < OPTIONS.white else some.plainest()
+    return some.with_masses_apart(some.best_along(taken))
 
 
 def misfit(fit: LawFit) -> float:
@@ -178,6 +179,11 @@ def _criteria(fits: Sequence[LawFit]) -> list[float]:
     """Schwarz's criterion of fits of the same arcs, by the residuals that the best leaves."""
     count = min(fits, key=misfit).independent
     return [criterion(misfit(fit) ** 2, count, len(fit.p)) for fit in fits]
+
+
+def _couples(row: Row) -> bool:
+    """Return whether a term is a constant mass that couples two coordinates."""
+    return max(row[0]) == 1 and sum(row[0]) == 2 and is_constant(row)
 
 
 def leading(problem: ArcProblem) -> list[tuple[int, ...]]:
@@ -419,9 +425,7 @@ class _Starts:
         near = [fit for fit in self.fits if misfit(fit) < OPTIONS.noise]
         if taken not in near:
             return taken
-        longer = near
-        for periods in self.problem.options.periods[1:3]:
-            longer = [fit.in_arcs(fit.problem.length(periods)) for fit in longer]
+        longer = self._along_longer(near)
         least = min(map(misfit, longer))
         if least > min(OPTIONS.white, OPTIONS.noise * self.least):
             count = len(self.fits)
@@ -437,6 +441,31 @@ class _Starts:
         best = int(np.argmin(above))
         deciding = self.problem.options.evidence.deciding
         return near[best] if above[best] < above[near.index(taken)] - deciding else taken
+
+    def with_masses_apart(self, taken: LawFit) -> LawFit:
+        """The start that was taken, or where odds do not decide against it one whose constant
+        masses couple no coordinates: linear motion has many masses, each with springs to suit, and
+        chance would choose."""
+        rows = taken.structure.terms
+        apart = [row for row in rows if not _couples(row)]
+        if len(apart) == len(rows) or taken.structure.leaders:
+            return taken
+        textbook = libraries.textbook(self.problem.dim, self.problem.angles)
+        forces = [row for row in textbook if not any(row[0])]
+        self.add(_Library(list(dict.fromkeys([*apart, *forces]))))
+        followed = [fit for fit in self.fits if misfit(fit) < np.inf]
+        others = [fit for fit in followed if not any(map(_couples, fit.structure.terms))]
+        if not others:
+            return taken
+        other = others[int(np.argmin(_criteria(others)))]
+        ours, theirs = _criteria(self._along_longer([taken, other]))
+        return other if theirs < ours + self.problem.options.evidence.deciding else taken
+
+    def _along_longer(self, fits: Sequence[LawFit]) -> Sequence[LawFit]:
+        """The same laws by longer arcs, which show more of what they lack."""
+        for periods in self.problem.options.periods[1:3]:
+            fits = [fit.in_arcs(fit.problem.length(periods)) for fit in fits]
+        return fits
 
     @property
     def least(self) -> float:
