@@ -431,6 +431,21 @@ def two_bodies(rng: np.random.Generator) -> System:
     return System({**body, **between}, (start, (0.0, 0.0)))
 
 
+def well(rng: np.random.Generator) -> System:
+    """About a centre off the origin: of light, of a ring of current, or of a spring across the way,
+    which is longer or shorter at rest than the way is far."""
+    centre, wide, deep = rng.uniform(-2, 2), rng.uniform(0.6, 1.2), rng.uniform(0.7, 1.5)
+    square = f"(x1-({centre}))**2"
+    shape = (
+        {f"exp(-{square}/{2 * wide**2})": deep * wide**2},
+        {f"1/sqrt(1+{square}/{3 * wide**2})**3": deep * wide**2},
+        {square: -deep / 2, f"sqrt({wide**2}+{square})": rng.uniform(0.3, 1.3) * deep * wide},
+    )[rng.integers(3)]
+    start = centre + rng.uniform(1, 1.5) * wide
+    friction = {"v1**2": rng.uniform(0.002, 0.01)}
+    return System({"v1**2": 0.5, **shape}, ((start,), (0.0,)), friction=friction)
+
+
 SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -442,7 +457,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
         *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
         *(elastic_on_video, orbit_off_the_origin),
-        *(load_friction, jointed_arm, polar, two_bodies),
+        *(load_friction, jointed_arm, polar, two_bodies, well),
     )
 }
 

@@ -244,7 +244,6 @@ def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     assert float(fit.hamiltonian.sympy().subs(at)) == pytest.approx(float(H.subs(at)), rel=2e-3)
 
 
-@pytest.mark.slow
 def trapped(field, spring, quartic):
     """q̈ of a charge in a magnetic field and a trap V = spring r² + quartic r⁴."""
 
@@ -254,6 +253,7 @@ def trapped(field, spring, quartic):
     return acceleration
 
 
+@pytest.mark.slow
 def test_a_trap_of_degree_four_in_a_magnetic_field_has_its_law():
     recording = recorded(trapped(2.2, 0.58, 0.39), [1.0, 0.1, 0.0, 0.6], 30, 900)
     fit = gfnn.fit(recording)
@@ -271,6 +271,13 @@ def test_a_round_orbit_leaves_open_which_powers_of_the_distance_hold_it():
 def test_powers_of_the_two_highest_degrees_may_be_a_series(degrees, last):
     found = libraries.last_of_series(libraries.potentials(2, (0, 1), *degrees))
     assert (sum(found[1]) if found else None) == last
+
+
+@pytest.mark.parametrize(("waves", "last"), [((1, 2), None), ((3,), None), ((1, 3), 3)])
+def test_the_shortest_waves_beside_longer_ones_may_be_a_series(waves, last):
+    rows = [((0, 0), (0, 0), (0, m), 0.0) for m in waves]
+    found = libraries.last_of_series(rows)
+    assert (found[2][1] if found else None) == last
 
 
 def test_one_energy_does_not_tell_a_mass_from_a_potential_of_many_terms():
@@ -293,6 +300,34 @@ def test_a_bead_on_a_wire_has_a_mass_that_depends_on_its_place():
     fit = gfnn.fit(recorded(acceleration, [1.3, 0.0], 100))
     scale = 2 * fit.lagrangian.terms[0].coefficient
     within_errors(fit.lagrangian, {"v1**2": 0.5, "v1**2*x1**2": 0.5, "x1**2": -0.5}, scale)
+
+
+def in_a_well(reach):
+    """A body in a well of light, −D exp(−(x − C)²/2w²), D = 0.8 and w = 0.9 about C = −1.7, from a
+    distance of so many w."""
+
+    def acceleration(q, v):
+        away = q + 1.7
+        return -0.8 / 0.81 * away * np.exp(-(away**2) / 1.62) - 0.01 * v
+
+    return recorded(acceleration, [-1.7 + 0.9 * reach, 0.0], 80, 1500)
+
+
+def test_a_well_about_a_centre_that_nobody_gave():
+    fit = gfnn.fit(in_a_well(1.2))
+    assert fit.verdict == "identified"
+    mass, well = fit.lagrangian.terms
+    number, about = map(float, re.findall(r"\d+\.\d+", well.term))
+    assert (mass.term, well.term) == ("v1**2", f"exp(-({number}*(x1 + {about}))**2)")
+    assert abs(well.coefficient - 0.8) < 4 * well.std < 0.01
+    assert number == pytest.approx(1 / (0.9 * np.sqrt(2)), rel=1e-3)
+    centre, error = fit.zeros["x1"]
+    assert abs(centre + 1.7) < 4 * error < 0.01
+
+
+@pytest.mark.slow
+def test_small_swings_in_a_well_leave_its_shape_open():
+    assert gfnn.fit(in_a_well(0.5)).verdict.startswith("one of several")
 
 
 def test_a_field_has_one_representative():

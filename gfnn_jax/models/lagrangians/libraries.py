@@ -35,6 +35,7 @@ FRICTIONS = tuple(kind.name for kind in TABLE)
 ALTERNATIVES = ({LINEAR, UNIFORM}, {QUADRATIC, ISOTROPIC})  # of which a law has one by choice
 CUBIC = 3.0  # the power of the speed that is tried
 HIGHEST = 6  # degree of potentials of lengths
+WAVES = 3  # of a turn, at most, that a potential of angles has
 FEW = 3  # coordinates: of more of them a term couples two, for others would be too many
 SHAPES = (  # of a length q, of which powers may be the series
     "exp(A*q) + exp(2*A*q)",  # of Morse
@@ -43,6 +44,15 @@ SHAPES = (  # of a length q, of which powers may be the series
     "cos(A*q) + sin(A*q)",
     "sqrt(1+(A*q)**2) + q",
     "1/(1+A*q) + q",
+    "1/(1+A*q)**3 + q",  # of two magnets
+    # Of one length about a centre C: wells of light, of Pöschl and Teller, of a charge, of a plate,
+    # of a ring of current
+    "exp(-(A*(q-C))**2)",
+    "1/(exp(A*(q-C))+exp(-A*(q-C)))**2",
+    "1/sqrt(1+(A*(q-C))**2)",
+    "1/(1+(A*(q-C))**2)",
+    "1/sqrt(1+(A*(q-C))**2)**3",
+    "sqrt(1+(A*(q-C))**2) + (q-C)**2",  # a spring across the way
 )
 GAINS = ("1/(1+A*q)", "1/(1+A*q)**2", "exp(A*q)")  # by which a force of inputs depends on q
 
@@ -209,15 +219,15 @@ def on_a_surface(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
-    """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
-    T."""
+    """Modes up to |m| = `WAVES` and their sines in V, up to 2 in T; powers of lengths up to
+    `HIGHEST` in V, 2 in T."""
     none, lengths = (0,) * dim, _lengths(dim, angles)
     rows: list[Row] = []
     for speeds in powers(dim, range(dim), 2):
         for m in modes(dim, angles, 2):
             rows += [(speeds, none, m, 0.0), (speeds, none, m, SINE)]
         rows += [(speeds, own, none, 0.0) for own in powers(dim, lengths, 1, 2)]
-    for m in modes(dim, angles, 3):
+    for m in modes(dim, angles, WAVES):
         rows += [(none, none, m, 0.0), (none, none, m, SINE)]
     rows += potentials(dim, lengths, *range(3, HIGHEST + 1))
     for i in lengths:
@@ -227,10 +237,16 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 
 def last_of_series(rows: Sequence[Row]) -> Row | None:
-    """The first potential of the highest degree, where that is one of the two highest tried: a
-    series of another shape may have been cut there. None where there is none."""
-    ends = [row for row in rows if not any(row[0]) and sum(row[1]) >= HIGHEST - 1]
-    return max(ends, key=lambda row: sum(row[1]), default=None)
+    """The first potential of the highest degree, where that is one of the two highest tried, or the
+    shortest wave of an angle beside longer ones: a series of another shape may have been cut there.
+    None where there is none."""
+    alone = [row for row in rows if not any(row[0])]
+    ends = [row for row in alone if sum(row[1]) >= HIGHEST - 1]
+    if ends:
+        return max(ends, key=lambda row: sum(row[1]))
+    longer = {i for row in alone for i, m in enumerate(row[2]) if 0 < abs(m) < WAVES}
+    shortest = (r for r in alone if any(abs(r[2][i]) == WAVES for i in longer))
+    return next(shortest, None)
 
 
 def central(dim: int, exponent: float) -> list[Row]:
@@ -243,19 +259,30 @@ def central(dim: int, exponent: float) -> list[Row]:
     return [(none, none, none, 0.0, shape), *fields]
 
 
-def shaped(shape: str, constant: float, along: Sequence[int], times: str = "1") -> list[Row]:
-    """The potentials that a sum of `SHAPES` is of, with this constant A, of the coordinate that is
-    1 in ``along``, less the one that is −1; ``times`` a function of inputs."""
+def is_centred(shape: str) -> bool:
+    """Return whether a shape has a centre of its own."""
+    return "C" in shape
+
+
+def shaped(
+    shape: str, place: tuple[float, float], along: Sequence[int], times: str = "1"
+) -> list[Row]:
+    """The potentials that a sum of `SHAPES` is of, with a constant A and a centre C, its
+    ``place``, of the coordinate that is 1 in ``along``, less the one that is −1; ``times`` a
+    function of inputs."""
     d, names = len(along), {1: "", -1: ""}
     names |= {sign: f"q{i + 1}" for i, sign in enumerate(along) if sign}
     length = f"({names[1]}-{names[-1]})" if names[-1] else names[1]
-    plain = potentials(d, np.flatnonzero(along), 1)
+    plain = {"q": potentials(d, np.flatnonzero(along), 1)} if times == "1" else {}
+    if not place[1]:
+        plain["(q-C)**2"] = potentials(d, np.flatnonzero(along), 2)
     rows: list[Row] = []
     for text in shape.split(" + "):
-        own = re.sub(r"\bq\b", length, text.replace("A", f"({constant:.8g})"))
+        own = text.replace("A", f"({place[0]:.8g})").replace("C", f"({place[1]:.8g})")
+        own = re.sub(r"\bq\b", length, own)
         tree = tree_of(times, d) * tree_of(own, d)
         one: Row = ((0,) * d, (0,) * d, (0,) * d, 0.0, to_text(tree, d, INPUTS))
-        rows += plain if text == "q" and times == "1" else [one]
+        rows += plain.get(text, [one])
     return rows
 
 

@@ -166,7 +166,7 @@ EARLY = (
     "the motion, as a controller does, and do not drive it: name what drives it (--inputs)"
 )
 SERIES = (
-    "powers up to {} may be a series of another shape, and hold within the "
+    "terms up to {} may be a series of another shape, and hold within the "
     "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms"
 )
 
@@ -297,7 +297,7 @@ def fit_recording(
             raise _with_nature(missed, data) from None
         raise
     lost = _loses_a_channel(law)
-    if _is_no_law(law) or (hidden and lost):
+    if _is_no_law(law) or (hidden and (lost or _gains_energy(best.fit))):
         missed = missed or no_law(data.problem.scales)
     if missed is None and (law.flaws or lost) and not hidden and (lost or not explained):
         what = _nature(data)
@@ -376,6 +376,19 @@ def _loses_a_channel(law: LearnedLaw) -> bool:
         and law.residual[name] > Options.above_noise * law.noise[name]
         for name, one in law.whiteness.items()
     )
+
+
+def _gains_energy(fit: LawFit) -> bool:
+    """Return whether some motion gains energy by the linear friction of a law for certain: each of
+    hidden modes may have a negative coefficient, but not all of them together."""
+    keys = fit.structure.keys()
+    own = [k for k, (kind, row) in enumerate(keys) if kind == "loss" and row[1] == LINEAR]
+    along = np.array([keys[k][1][0] for k in own], float).reshape(len(own), fit.form.dim)
+    values = np.array([fit.values[keys[k]] for k in own])
+    power = np.linalg.eigh(along.T @ (values[:, None] * along))
+    share = (along @ power.eigenvectors[:, 0]) ** 2
+    error = np.sqrt(share @ fit.linearised.covariance[np.ix_(own, own)] @ share)
+    return bool(power.eigenvalues[0] < -fit.problem.options.evidence.significant * error)
 
 
 def _nature(data: RecordingData) -> Nature:

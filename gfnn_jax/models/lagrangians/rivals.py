@@ -12,12 +12,11 @@ import dataclasses
 import shlex
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import FitError
@@ -39,6 +38,7 @@ from gfnn_jax.models.lagrangians.libraries import (
     GAINS,
     SHAPES,
     central,
+    is_centred,
     losses,
     potentials,
     shaped,
@@ -50,17 +50,22 @@ from gfnn_jax.models.lagrangians.libraries import (
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
 
+Place = tuple[float, float]  # the constant inside a shape, and its centre
+
 
 class Options:
     """Limits of what is tried (`benchmarks/any_record.py`, `vocabulary.py`).
 
     most: powers of the distance to either side. series: potentials, from which on they may be the
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
-    finer: between half and twice the best of them; near: of what the best shape leaves of the
-    equations of motion, above which another is not fitted; apart: relative, over which it is
-    differentiated; imitated: share of what it changes that no coefficient does, below which it is
-    not known; corrections: of it; furthest: relative, of each; settled: standard errors,
-    within which it is found. noise: times it, that is no more;
+    centres: of a shape, quantiles of the motion, where these begin; finer: between half and twice
+    the best of them; first, close: steps of the constant, relative, and of the centre, in its
+    inverse, by which these are found together; beyond: factor of the constant, to either side, at
+    most; near: of what the best shape leaves of the equations
+    of motion, above which another is not fitted; apart: relative, over which it is differentiated;
+    imitated: share of what it changes that no coefficient does, below which it is not known;
+    corrections: of it; furthest: relative, of each; settled: standard errors, within which it is
+    found. noise: times it, that is no more;
     fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
     as_fast: relative, within which it is found. clearly: of Schwarz's
     criterion, that a sensor gains where a law leaves more; explains: of what that law leaves, the
@@ -71,7 +76,11 @@ class Options:
     most: int = 4
     series: int = 3
     constants: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    centres: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
     finer: int = 9
+    first: float = 0.3
+    close: float = 1e-3
+    beyond: float = 4.0
     near: float = 4.0
     apart: float = 1e-4
     imitated: float = 1e-4
@@ -213,8 +222,8 @@ def with_a_shape(fit: LawFit) -> LawFit:
     if not alone or fit.problem.angles or not fit.follows:
         return fit
     lengths = [(1,)] if d == 1 else _lengths_of(series)
-    shapes = product(GAINS if driven else SHAPES, lengths)
-    begun = {one: tried.nearest(*one) for one in shapes}
+    names = GAINS if driven else [name for name in SHAPES if d == 1 or not is_centred(name)]
+    begun = {one: tried.nearest(*one) for one in product(names, lengths)}
     (_, length), _ = min(begun.items(), key=lambda one: one[1][1])
     close = [
         (name, *tried.closer(name, length, near))
@@ -222,8 +231,8 @@ def with_a_shape(fit: LawFit) -> LawFit:
         if along == length
     ]
     found, most = [(fit.criterion(), "", fit)], Options.near * min(left for *_, left in close)
-    for name, constant, left in close:
-        other = tried.fitted(name, length, constant) if left <= most else None
+    for name, place, left in close:
+        other = tried.fitted(name, length, place) if left <= most else None
         if other is not None:
             found.append((other.criterion(fit.independent) + np.log(fit.independent), name, other))
     least = min(cost for cost, _, _ in found) + fit.problem.options.evidence.deciding
@@ -250,47 +259,74 @@ class _Shapes:
     plain: tuple[Row, ...]
     times: str
 
-    def structure(self, name: str, along: Sequence[int], constant: float) -> Structure:
+    def structure(self, name: str, along: Sequence[int], place: Place) -> Structure:
         """The terms with this shape of the length ``along``, as `libraries.shaped` has it."""
         ends = tuple(map(bool, along))
         beside = [row for row in self.plain if sum(row[1]) < 2 or tuple(map(bool, row[1])) != ends]
-        terms = (*self.kept, *beside, *shaped(name, constant, along, self.times))
+        terms = (*self.kept, *beside, *shaped(name, place, along, self.times))
         return dataclasses.replace(self.fit.structure, terms=tuple(dict.fromkeys(terms)))
 
-    def left(self, name: str, along: Sequence[int], constant: float) -> float:
+    def left(self, name: str, along: Sequence[int], place: Place) -> float:
         """Share of the squares of the equations of motion that it leaves; infinite where it
         overflows."""
         with contextlib.suppress(np.linalg.LinAlgError):
-            structure = self.structure(name, along, constant)
+            structure = self.structure(name, along, place)
             share = weak_share(structure, self.fit.problem, len(along) == 1)
             return share if np.isfinite(share) else np.inf
         return np.inf
 
-    def nearest(self, name: str, along: Sequence[int]) -> tuple[float, float]:
-        """The constant of a few that leaves least, and what it leaves."""
+    def nearest(self, name: str, along: Sequence[int]) -> tuple[Place, float]:
+        """The place of a few that leaves least, and what it leaves."""
         q = self.fit.problem.states[:, : len(along)] @ np.array(along)
-        sizes = np.array(Options.constants) / np.ptp(q)
-        tried = {a: self.left(name, along, a) for a in (*sizes, *-sizes)}
+        sizes, centres = np.array(Options.constants) / np.ptp(q), [0.0]
+        if is_centred(name):
+            centres = np.quantile(q, Options.centres).tolist()
+        else:
+            sizes = np.concatenate([sizes, -sizes])
+        tried = {place: self.left(name, along, place) for place in product(sizes, centres)}
         return min(tried.items(), key=lambda one: one[1])
 
-    def closer(self, name: str, along: Sequence[int], near: float) -> tuple[float, float]:
-        """The constant near this one that leaves least, and what it leaves."""
-        finer = near * np.geomspace(0.5, 2.0, Options.finer)  # beyond some a shape may be singular
-        at = int(np.argmin([self.left(name, along, a) for a in finer]))
-        ends = sorted(finer[[max(at - 1, 0), min(at + 1, len(finer) - 1)]])
-        left = partial(self.left, name, along)
-        least_at: Any = minimize_scalar(left, bounds=ends, method="bounded")
-        return float(least_at.x), float(least_at.fun)
+    def closer(self, name: str, along: Sequence[int], near: Place) -> tuple[Place, float]:
+        """The place near this one that leaves least, and what it leaves."""
+        constant, centre = near
+        if is_centred(name):
 
-    def fitted(self, name: str, along: Sequence[int], constant: float) -> LawFit | None:
+            def moved(by: np.ndarray) -> Place:
+                return float(constant * np.exp(by[0])), float(centre + by[1] / constant)
+
+            begin = Options.first * np.eye(3, 2, -1)
+            far = np.log(Options.beyond)  # where it is a power, or a peak
+            found = minimize(
+                lambda by: self.left(name, along, moved(by)) if abs(by[0]) < far else np.inf,
+                begin[0],
+                method="Nelder-Mead",
+                options={"initial_simplex": begin, "xatol": Options.close, "fatol": np.inf},
+            )
+            return moved(found.x), float(found.fun)
+        finer = constant * np.geomspace(0.5, 2.0, Options.finer)  # a shape may be singular beyond
+        at = int(np.argmin([self.left(name, along, (a, 0.0)) for a in finer]))
+        ends = sorted(finer[[max(at - 1, 0), min(at + 1, len(finer) - 1)]])
+        least_at: Any = minimize_scalar(
+            lambda a: self.left(name, along, (a, 0.0)), bounds=ends, method="bounded"
+        )
+        return (float(least_at.x), 0.0), float(least_at.fun)
+
+    def fitted(self, name: str, along: Sequence[int], place: Place) -> LawFit | None:
         """The fit with the likeliest constant from this one on, without the plain terms that are
-        not likely; None where no orbit follows."""
-        structure = self.structure(name, along, constant)
+        not likely; None where no orbit follows. The centre is the zero of the coordinate."""
+        structure = self.structure(name, along, place)
         try:
             structure, known = weak_start(structure, self.fit.problem, False)
         except (FitError, np.linalg.LinAlgError):
             return None
-        fit = with_constant(self.fit.again(structure, known, rescale=False), False)
+        arcs = self.fit.followed
+        if is_centred(name):
+            about = self.structure(name, along, (place[0], 0.0))
+            own = (known[key] for key in structure.keys())  # noqa: SIM118
+            known = {**dict(zip(about.keys(), own, strict=True)), ("zero", 0): place[1]}
+            structure = about.plus([("zero", 0)])
+            arcs = dataclasses.replace(arcs, x=arcs.x - np.array([place[1], 0.0]))
+        fit = with_constant(self.fit.again(structure, known, arcs, rescale=False), False)
         if not (fit.follows and fit.is_definite):
             return None
         free = [("term", row) for row in self.plain]
