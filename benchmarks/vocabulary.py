@@ -431,6 +431,22 @@ def two_bodies(rng: np.random.Generator) -> System:
     return System({**body, **between}, (start, (0.0, 0.0)))
 
 
+def three_bodies(rng: np.random.Generator) -> System:
+    """In a row on springs at its ends, with the force of Toda, or of two magnets, between them."""
+    a, depth = rng.uniform(0.6, 1.3), rng.uniform(0.4, 1)
+    k1, k3, m2, m3 = rng.uniform((0.2, 0.2, 0.4, 0.4), (0.5, 0.5, 0.7, 0.7)).tolist()
+    chain = {"v1**2": 0.5, "v2**2": m2, "v3**2": m3, "x1**2": -k1, "x3**2": -k3}
+    if rng.integers(2):
+        chain |= {f"exp({a}*(x1-x2))": -depth, f"exp({a}*(x2-x3))": -depth}
+        pull = a * depth
+    else:
+        chain |= {"1/(3-x1+x2)**3": -9 * depth, "1/(3-x2+x3)**3": -9 * depth}
+        pull = depth / 3
+    chain |= {"x1": pull, "x3": -pull}
+    start = rng.uniform((-1, -0.2, 0.4), (-0.4, 0.2, 1)).tolist()
+    return System(chain, (tuple(start), (0.0, float(rng.uniform(-0.3, 0.3)), 0.0)))
+
+
 def well(rng: np.random.Generator) -> System:
     """About a centre off the origin: of light, of a ring of current, or of a spring across the way,
     which is longer or shorter at rest than the way is far."""
@@ -457,7 +473,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
         *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
         *(elastic_on_video, orbit_off_the_origin),
-        *(load_friction, jointed_arm, polar, two_bodies, well),
+        *(load_friction, jointed_arm, polar, two_bodies, well, three_bodies),
     )
 }
 

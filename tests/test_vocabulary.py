@@ -330,6 +330,23 @@ def test_small_swings_in_a_well_leave_its_shape_open():
     assert gfnn.fit(in_a_well(0.5)).verdict.startswith("one of several")
 
 
+@pytest.mark.slow
+def test_three_bodies_in_a_row_have_one_shape_between_neighbours():
+    """Toda's, V = 0.8 (e^(−0.9 s) + 0.9 s) of s the stretch of each bond, springs at the ends."""
+    mass = np.array([1.0, 1.3, 0.9])
+
+    def acceleration(q, v):
+        pull = np.pad(0.72 * (1 - np.exp(-0.9 * np.diff(q))), 1)
+        return (np.diff(pull) - np.array([0.5, 0.0, 0.7]) * q) / mass
+
+    fit = gfnn.fit(recorded(acceleration, [-0.7, 0.1, 0.8, 0.0, 0.2, 0.0], 60, 1500))
+    assert fit.verdict == "identified"
+    bonds = [term for term in fit.lagrangian.terms if "exp" in term.term]
+    assert len(bonds) == 2
+    assert len(fit.lagrangian.terms) == 9
+    assert np.allclose([term.coefficient for term in bonds], -0.8, rtol=2e-3)
+
+
 def test_a_field_has_one_representative():
     """v_j f(q) and the gradients v·∇χ are independent, and with these any field is one."""
     rows = libraries.gyroscopic(3, (), 2)

@@ -51,6 +51,7 @@ from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure, is_
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
 
 Place = tuple[float, float]  # the constant inside a shape, and its centre
+Lengths = tuple[tuple[int, ...], ...]  # each a coordinate, 1, or that less another one, −1
 
 
 class Options:
@@ -221,7 +222,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
     alone = many >= (2 if driven else Options.series) and not (driven and d > 1)
     if not alone or fit.problem.angles or not fit.follows:
         return fit
-    lengths = [(1,)] if d == 1 else _lengths_of(series)
+    lengths = [((1,),)] if d == 1 else _lengths_of(series)
     names = GAINS if driven else [name for name in SHAPES if d == 1 or not is_centred(name)]
     begun = {one: tried.nearest(*one) for one in product(names, lengths)}
     (_, length), _ = min(begun.items(), key=lambda one: one[1][1])
@@ -247,7 +248,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
 
 @dataclasses.dataclass(frozen=True)
 class _Shapes:
-    """Shapes of a length in place of powers in the law of a fit.
+    """Shapes of lengths in place of powers in the law of a fit, with one number inside.
 
     kept: terms of the law beside them. plain: powers of degree 1 and 2 that may stand beside them
     too, but for that which makes a spring of the length. times: a function of inputs by which the
@@ -259,26 +260,27 @@ class _Shapes:
     plain: tuple[Row, ...]
     times: str
 
-    def structure(self, name: str, along: Sequence[int], place: Place) -> Structure:
-        """The terms with this shape of the length ``along``, as `libraries.shaped` has it."""
-        ends = tuple(map(bool, along))
-        beside = [row for row in self.plain if sum(row[1]) < 2 or tuple(map(bool, row[1])) != ends]
-        terms = (*self.kept, *beside, *shaped(name, place, along, self.times))
+    def structure(self, name: str, along: Lengths, place: Place) -> Structure:
+        """The terms with this shape of each length ``along``, as `libraries.shaped` has it."""
+        ends = {tuple(map(bool, one)) for one in along}
+        beside = [r for r in self.plain if sum(r[1]) < 2 or tuple(map(bool, r[1])) not in ends]
+        shapes = (row for one in along for row in shaped(name, place, one, self.times))
+        terms = (*self.kept, *beside, *shapes)
         return dataclasses.replace(self.fit.structure, terms=tuple(dict.fromkeys(terms)))
 
-    def left(self, name: str, along: Sequence[int], place: Place) -> float:
+    def left(self, name: str, along: Lengths, place: Place) -> float:
         """Share of the squares of the equations of motion that it leaves; infinite where it
         overflows."""
         with contextlib.suppress(np.linalg.LinAlgError):
             structure = self.structure(name, along, place)
-            share = weak_share(structure, self.fit.problem, len(along) == 1)
+            share = weak_share(structure, self.fit.problem, structure.dim == 1)
             return share if np.isfinite(share) else np.inf
         return np.inf
 
-    def nearest(self, name: str, along: Sequence[int]) -> tuple[Place, float]:
+    def nearest(self, name: str, along: Lengths) -> tuple[Place, float]:
         """The place of a few that leaves least, and what it leaves."""
-        q = self.fit.problem.states[:, : len(along)] @ np.array(along)
-        sizes, centres = np.array(Options.constants) / np.ptp(q), [0.0]
+        q = self.fit.problem.states[:, : self.fit.problem.dim] @ np.array(along).T
+        sizes, centres = np.array(Options.constants) / np.max(np.ptp(q, axis=0)), [0.0]
         if is_centred(name):
             centres = np.quantile(q, Options.centres).tolist()
         else:
@@ -286,7 +288,7 @@ class _Shapes:
         tried = {place: self.left(name, along, place) for place in product(sizes, centres)}
         return min(tried.items(), key=lambda one: one[1])
 
-    def closer(self, name: str, along: Sequence[int], near: Place) -> tuple[Place, float]:
+    def closer(self, name: str, along: Lengths, near: Place) -> tuple[Place, float]:
         """The place near this one that leaves least, and what it leaves."""
         constant, centre = near
         if is_centred(name):
@@ -311,7 +313,7 @@ class _Shapes:
         )
         return (float(least_at.x), 0.0), float(least_at.fun)
 
-    def fitted(self, name: str, along: Sequence[int], place: Place) -> LawFit | None:
+    def fitted(self, name: str, along: Lengths, place: Place) -> LawFit | None:
         """The fit with the likeliest constant from this one on, without the plain terms that are
         not likely; None where no orbit follows. The centre is the zero of the coordinate."""
         structure = self.structure(name, along, place)
@@ -347,16 +349,17 @@ class _Shapes:
         return improved(fit, least_seen, without)
 
 
-def _lengths_of(rows: Sequence[Row]) -> list[tuple[int, ...]]:
+def _lengths_of(rows: Sequence[Row]) -> list[Lengths]:
     """The lengths that powers may be a series in: the coordinate of a term, or the difference of
-    its two."""
+    its two; and of more bodies than two the distances of neighbours together."""
     found: dict[tuple[int, ...], None] = {}
     for row in rows:
         along = [0] * len(row[1])
         for axis, sign in zip(np.flatnonzero(row[1]), (1, -1), strict=False):
             along[axis] = sign
         found[tuple(along)] = None
-    return list(found)
+    between = tuple(one for one in found if -1 in one)
+    return [*((one,) for one in found), *([between] if len(between) > 1 else [])]
 
 
 def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
