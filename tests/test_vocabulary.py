@@ -405,6 +405,16 @@ def test_a_drive_between_two_frequencies_that_are_tried_is_found_beside_an_own_o
 
 
 @pytest.mark.slow
+def test_no_drive_is_made_up_for_what_grows_to_its_cycle():
+    def acceleration(q, v):
+        return -q + 0.04 * v - 0.08 * v**3
+
+    fit = gfnn.fit(recorded(acceleration, [0.4, 0.0], 80, 2000))
+    assert fit.verdict.startswith("partly")
+    assert not any("a drive" in line for line in fit.messages)
+
+
+@pytest.mark.slow
 def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():
     """A support that moves and a magnet: ½v² − ½(x − u)² + i²/(0.4 + x); the oracle is SciPy."""
     given = given_terms(["V: (x - u)**2", "V: i**2/(0.4 + x)"], ["x"], ["v"], (), ["u", "i"])

@@ -40,7 +40,8 @@ class Options:
     rank: of the terms' columns, relative. settled: standard errors, within which a frequency is
     found. most: corrections. apart: turns over the record, by which waves are differentiated.
     fractions, harmonics: of a frequency, that periodic motion may have; noise: times it, that such
-    motion leaves.
+    motion leaves; low: harmonics of one whose size changes, as a polynomial of this degree in time,
+    and grows: of its variance, that it leaves.
     """
 
     spacing: float = 0.25
@@ -57,6 +58,8 @@ class Options:
     fractions: tuple[int, ...] = (1, 2, 3)
     harmonics: int = 12
     noise: float = 3.0
+    low: int = 3
+    grows: float = 5e-4
 
 
 def hidden_frequency(problem: ArcProblem, stiff: bool, known: Sequence[float] = ()) -> float | None:
@@ -103,21 +106,26 @@ def _lowest(
 
 def _repeats(problem: ArcProblem, omega: float) -> bool:
     """Return whether the later half of the motion is periodic, with this frequency or a fraction of
-    it: what sustains itself is so too, and a drive would imitate it."""
+    it, or all of it is but for a size that grows or fades: what sustains itself, or grows to its
+    cycle, is so too, and a drive would imitate it."""
     t, q = np.concatenate([n.t for n in problem.nodes]), problem.states[:, : problem.dim]
+    sigma = np.median(problem.state_scale(problem.scales.sigma)[: problem.dim])
     late = t > np.median(t)
-    t, q, sigma = (
-        t[late],
-        q[late],
-        np.median(problem.state_scale(problem.scales.sigma)[: problem.dim]),
-    )
-    for part in Options.fractions:
-        turned = np.outer(t, omega / part * np.arange(Options.harmonics + 1))
+
+    def left(t: np.ndarray, q: np.ndarray, part: int, harmonics: int, powers: int) -> float:
+        """Variance, of that of q, that waves leave whose sizes are polynomials of the time."""
+        turned = np.outer(t, omega / part * np.arange(harmonics + 1))
         waves = np.concatenate([np.cos(turned), np.sin(turned[:, 1:])], axis=1)
+        place = (t - t[0]) / np.ptp(t)
+        waves = np.concatenate([waves * place[:, None] ** n for n in range(powers)], axis=1)
         rest = q - waves @ np.linalg.lstsq(waves, q, rcond=None)[0]
-        if np.sqrt(np.mean(rest**2)) < Options.noise * sigma:
-            return True
-    return False
+        return float(np.mean(rest**2) / np.mean(np.var(q, axis=0)))
+
+    noise = (Options.noise * sigma) ** 2 / np.mean(np.var(q[late], axis=0))
+    parts, many = Options.fractions, Options.harmonics
+    if any(left(t[late], q[late], part, many, 1) < noise for part in parts):
+        return True
+    return left(t, q, 1, Options.low, Options.low + 1) < Options.grows
 
 
 def with_frequency(fit: LawFit, omega: float) -> tuple[LawFit, float, float]:
