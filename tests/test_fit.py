@@ -181,6 +181,14 @@ def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
     assert fit.messages == ()
 
 
+def test_predictions_that_leave_the_data_say_so(pendulum_fit):
+    with pytest.warns(gfnn.FitWarning, match="1 of 2 orbits leave the states"):
+        pendulum_fit.predict([[0.1, 0.0], [0.0, 1.6]], 50)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pendulum_fit.predict([0.1, 0.0], 50)
+
+
 @pytest.mark.slow
 def test_one_of_the_candidates_is_chosen(pendulum_fit):
     chosen = pendulum_fit.chosen

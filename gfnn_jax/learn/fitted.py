@@ -461,8 +461,22 @@ class Fit:
 
     def predict(self, z0: Any, num_steps: int, **options: Any) -> np.ndarray:
         """States (B, num_steps + 1, 2d), or (num_steps + 1, 2d), that follow z0 (B, 2d) or (2d,):
-        those of `SymplecticMap.rollout`, whose ``options`` it takes."""
-        return np.asarray(self.map.rollout(z0, num_steps, **options)[0])
+        those of `SymplecticMap.rollout`, whose ``options`` it takes. Warns (FitWarning) where
+        orbits leave the states that the map was fitted to."""
+        states, info = self.map.rollout(z0, num_steps, **options)
+        left = np.atleast_1d(info.left_at)
+        if (out := left[left >= 0]).size:
+            line = (
+                f"{len(out)} of {len(left)} orbits leave the states that the map was fitted to, "
+                f"the first after {np.min(out)} steps: what follows is extrapolated"
+            )
+            found = self.found
+            if isinstance(found, Choice) and found.law and found.chosen.learns != "hamiltonian":
+                line += (
+                    ". The law's own flow holds farther: gfnn.fit(pairs, model=gfnn.Hamiltonian())"
+                )
+            warnings.warn(line, FitWarning, stacklevel=2)
+        return np.asarray(states)
 
     def plot(self) -> Any:
         """Figure (matplotlib) of the law against its recording, or of the candidates of a map."""
