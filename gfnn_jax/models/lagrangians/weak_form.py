@@ -16,6 +16,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dtrtri  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.friction import LINEAR, Friction
@@ -328,9 +329,19 @@ def _integrals(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
 def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least squares X c = Y: c, residuals in the shape of Y, and R⁻¹ of the factor."""
     flat = X.reshape(X.shape[0] * X.shape[1], X.shape[2])
-    scale = np.linalg.norm(flat, axis=0)
-    Q, R = np.linalg.qr(flat / scale)
-    inverse = np.linalg.pinv(R, rcond=Options.rank)
-    c = inverse @ (Q.T @ Y.reshape(-1))
-    residual = Y - (flat / scale @ c).reshape(Y.shape)
+    n, scale = flat.shape[1], np.linalg.norm(flat, axis=0)
+    both = np.concatenate([flat / scale, Y.reshape(-1, 1)], axis=1)
+    R = np.asarray(np.linalg.qr(both, mode="r"))[:n]
+    inverse = _inverse(R[:, :n])
+    c = inverse @ R[:, n]
+    residual = Y - (both[:, :n] @ c).reshape(Y.shape)
     return c / scale, residual, inverse / scale[:, None]
+
+
+def _inverse(R: np.ndarray) -> np.ndarray:
+    """The inverse of a triangle, of its part above roundoff where that is not all of it."""
+    inverse, singular = dtrtri(R) if R.shape[0] == R.shape[1] > 0 else (R, 1)
+    size = np.linalg.norm(R) * np.linalg.norm(inverse)  # above that of its singular values
+    if singular or not size < 1 / Options.rank:
+        return np.linalg.pinv(R, rcond=Options.rank)
+    return inverse
