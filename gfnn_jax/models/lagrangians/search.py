@@ -290,8 +290,8 @@ class TermSearch:
         of these."""
         fit, choice = self.with_friction(with_fine_steps(fit))
         fit = with_zeros_of_runs(fit)
-        shorter = self.telling_more(fit)
         found = self._settled(fit, choice)
+        shorter = self.telling_more(fit) if found.follows else None
         if shorter is None:
             return found
         periods = shorter.arcs.t.shape[1] / fit.problem.scales.per_period
