@@ -568,6 +568,29 @@ def test_a_sensor_that_sharpens_or_that_is_not_seen_beside_a_drive_is_none(dampi
     assert of_a_sensor(fit) == ("", False)
 
 
+def test_sensors_that_explain_little_of_what_a_plain_law_leaves_are_not_fitted(monkeypatch):
+    """A spring that is softer on one side, which none of the sensors imitates: one fit of the plain
+    law tells so of all."""
+    t = 0.1 * np.arange(400)
+    x = motion(lambda q, v: -q - 0.4 * q**2 - 0.02 * v, np.array([0.8, 0.0]), t)[0]
+    x = x + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
+    terms = [((n == 0) * 2, n) for n in (0, 1, 2, 3)]
+    rows = tuple(((of_v,), (n,), (0,), 0.0) for of_v, n in terms)
+    law = Structure(1, rows, (((1,), LINEAR, 0.0),))
+    known = {("term", rows[2]): -0.5, ("term", rows[3]): -0.4 / 3, ("loss", law.friction[0]): 0.01}
+    fit = problem.fit(law, known, problem.arcs(4.0), problem.scales.sigma)
+    assert fit.loudest < 1.1
+    fitted, one = [], type(problem).fit
+    monkeypatch.setattr(
+        type(problem),
+        "fit",
+        lambda *given, **options: fitted.append(one(*given, **options)) or fitted[-1],
+    )
+    assert of_a_sensor(fit) == ("", False)
+    assert len(fitted) == 1
+
+
 @pytest.mark.slow
 def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
     """A hardening spring in the plane, V = ½ r² + 0.2 r⁴, along an orbit of few distances."""

@@ -30,7 +30,7 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
-from gfnn_jax.fitting.evidence import improved
+from gfnn_jax.fitting.evidence import criterion, improved
 from gfnn_jax.maps.observation import observed
 from gfnn_jax.models.lagrangians.exchange import may_be_chosen
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, places
@@ -70,8 +70,9 @@ class Options:
     fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
     as_fast: relative, within which it is found. clearly: of Schwarz's
     criterion, that a sensor gains where a law leaves more; explains: of what that law leaves, the
-    share that the one beside the sensor may leave, where it is no noise. much: of a coefficient,
-    that a spring which is not seen would have to move; told: times it, up to which that is told.
+    share that the one beside the sensor may leave, where it is no noise, and of what the plain law
+    leaves by itself, in squares close to it. much: of a coefficient, that a spring which is not
+    seen would have to move; told: times it, up to which that is told.
     """
 
     most: int = 4
@@ -528,19 +529,25 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
             known = weak_start(plain, problem, prune=False)[1]
     least = fit.criterion() + Options.clearly * (1 if is_noise else -1)
     alone = d == 1 and not problem.num_inputs  # and may be late unseen
+
+    def begun(other: ArcProblem, structure: Structure, start: dict[Key, float]) -> LawFit:
+        own = dataclasses.replace(structure, sensors=other.sensors)
+        return other.fit(own, start, fit.followed, fit.sigma, rescale=False)
+
     for i, name in enumerate(seen.coordinates):
         q, v = symbols((name, seen.speeds[i]))
+        zero = " + zero" * (i in fit.structure.zeros)
+        as_it_is = _shown(problem, name, q + zero) if zero else problem
+        base = begun(as_it_is, plain, known) if known else None
         for what, sensor in SENSORS[:3] if alone else SENSORS:
-            text = sensor.format(q=q, v=v) + " + zero" * (i in fit.structure.zeros)
-            shown = observed({name: text}, seen.coordinates, seen.speeds, {}, columns=seen.channels)
-            shown = dataclasses.replace(shown, loss=seen.loss)
-            other = dataclasses.replace(problem, observation=shown)
+            text = sensor.format(q=q, v=v) + zero
+            other = _shown(problem, name, text)
             fewer = _without_needless(fit, other, odd)
-            tried = [(plain, known)] if known else []
+            may = base is not None and _may_be_likelier(base, other, count, least)
+            tried = [(plain, known)] if may else []
             tried += [(fewer, fit.values)] if fewer else []
             for structure, start in tried:
-                own = dataclasses.replace(structure, sensors=other.sensors)
-                again = other.fit(own, start, fit.followed, fit.sigma, rescale=False)
+                again = begun(other, structure, start)
                 unlikely = again.criterion(count)
                 most = max(Options.noise, Options.explains * fit.loudest)
                 follows = smoothed or again.loudest < most
@@ -551,6 +558,28 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
                         f"a plainer law follows the record where {name} {what}: --observe {typed}"
                     )
     return best, enough
+
+
+def _shown(problem: ArcProblem, name: str, text: str) -> ArcProblem:
+    """The problem of a plain recording with one coordinate shown by a formula."""
+    seen = problem.observation
+    shown = observed({name: text}, seen.coordinates, seen.speeds, {}, columns=seen.channels)
+    return dataclasses.replace(problem, observation=dataclasses.replace(shown, loss=seen.loss))
+
+
+def _may_be_likelier(base: LawFit, other: ArcProblem, count: float, least: float) -> bool:
+    """Return whether the law of a fit may come below a criterion by the sensor of another problem:
+    that explains half of what the law leaves, or as much as it takes, close to it. A law that was
+    not found tells nothing."""
+    if not base.follows:
+        return True
+    sensors = tuple((name, 0.0) for name, _ in other.sensors)
+    own = dataclasses.replace(base.structure, sensors=sensors)
+    fitted, new = places(own, base.structure, [k for k in own.keys() if k not in base.values])  # noqa: SIM118
+    found = other.linearised(own, base).added(fitted, new)
+    share = float(found.left[0] / found.rest) ** 2
+    likely = criterion(share * base.fitted.cost, count, len(own.keys())) < least
+    return likely or not share > Options.explains
 
 
 def _is_a_sensor(fit: LawFit) -> bool:
