@@ -3,7 +3,7 @@ has no bracket."""
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 
 import gfnn_jax as gfnn
 from gfnn_jax.brackets import Bracket
@@ -55,14 +55,12 @@ def lorenz(z):
 
 
 def runs_of(field, starts, dt, steps, noise=0.0):
-    """All runs are integrated at once: field takes states in columns (d, N)."""
-    rng, parts, shape = np.random.default_rng(1), [], starts.T.shape
-    times = dt * np.arange(steps + 1)
-    how = {"method": "DOP853", "rtol": 3e-14, "atol": 1e-15, "t_eval": times}
-    found = solve_ivp(
-        lambda t, z: np.ravel(field(z.reshape(shape))), (0, times[-1]), starts.T.ravel(), **how
-    )
-    for run, z in enumerate(found.y.reshape(*shape, -1).transpose(1, 2, 0)):
+    """All runs are integrated at once, each step from the state before: between an integrator's own
+    steps it interpolates, to 4e-13 of the spread. field takes states in columns (d, N)."""
+    rng, parts, states = np.random.default_rng(1), [], [starts]
+    for _ in range(steps):
+        states.append(moved(lambda _, z: field(z), states[-1], dt, rtol=3e-14, atol=1e-15))
+    for run, z in enumerate(np.stack(states, axis=1)):
         z = z + noise * rng.normal(size=z.shape)
         parts.append((z[:-1], z[1:], np.full(steps, run), np.arange(steps)))
     z0, z1, run, place = map(np.concatenate, zip(*parts, strict=True))
