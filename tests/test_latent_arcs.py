@@ -205,12 +205,15 @@ def test_straight_steps_follow_bent_ones_that_fail(monkeypatch):
     """As where a body sticks: whatever bends along a step there, the states do not."""
     y, x = np.zeros((1, 4, 3)), np.zeros((1, 4, 1))
     y[..., 2] = 1.0
-    monkeypatch.setattr(
-        latent_arcs._AtStates,
-        "_curved",
-        lambda self, dp, dx, damping: latent_arcs.Tried(self.here, -np.inf, damping),
-    )
+    failed = []
+
+    def curved(self, dp, dx, damping):
+        failed.append(damping)
+        return latent_arcs.Tried(self.here, -np.inf, damping)
+
+    monkeypatch.setattr(latent_arcs._AtStates, "_curved", curved)
     start = np.array([-1.2, 1.0])
     fit = Readings(_Bent(), y, np.full(3, 0.01)).fit(start, x, np.array([0.01]))
     residuals = [(30 * (q - p**2), 1 - p) for p, q in (start, fit.p)]
     assert np.linalg.norm(residuals[1]) < 0.2 * np.linalg.norm(residuals[0])
+    assert len(failed) < 3 * fit.iterations

@@ -21,8 +21,8 @@ Where it is not white, a *whitening* (`solve.noise`) mixes residuals along an ar
 Where the least residuals lie in a canyon that bends, as of coefficients that act on what nothing
 shows, or of masses that phases alone tell apart, a straight step soon leaves it, and brings less
 than it promised. From then on steps bend as the canyon does: δ + ½ a, a the acceleration that keeps
-the linearised residuals (geodesic acceleration: Transtrum & Sethna, arXiv:1207.4999). Each needs
-one further evaluation, without derivatives.
+the linearised residuals (geodesic acceleration: Transtrum & Sethna, arXiv:1207.4999), as long as
+one of them lowers the cost. Each needs one further evaluation, without derivatives.
 """
 
 from __future__ import annotations
@@ -382,7 +382,8 @@ class _AtStates:
     they are small all in all (`closed`); where a descent has ended so, with a jump that readings
     pull open, until each arc is an orbit (``joins``). Once a step has brought much less than the
     linear problem promised, steps are bent along the valley (``bends``), where the model is a
-    `Stepping` one.
+    `Stepping` one; until at one place none of these lowers the cost: at the next one a straight
+    step comes first again.
     """
 
     data: _Data
@@ -430,7 +431,7 @@ class _AtStates:
             if not decrease > 0 and stays.any():
                 there, stays = self._begun_anew(there, stays)
                 decrease = self._decrease(there, share, stays)
-        return Tried(there, decrease, damping)
+        return Tried(_Ahead(there, straightened=bends), decrease, damping)
 
     def _each(self) -> Tried:
         """A step of arcs that share nothing, each as far as is best for it."""
@@ -441,7 +442,8 @@ class _AtStates:
         dx[arcs] = _solve(_reduced(here, arcs), defects, 0.0)[1]
         there = self.data.moved(here, arcs, here.x[arcs] + dx[arcs])
         there, _ = self._alone(there, 1.0, dx)
-        return Tried(there, np.sum(here.merits - there.merits), 0.0, hopeless=True)
+        decrease = np.sum(here.merits - there.merits)
+        return Tried(_Ahead(there), decrease, 0.0, hopeless=True)
 
     def _curved(self, dp: np.ndarray, dx: np.ndarray, damping: float) -> Tried:
         """The end of a whole step that bends, or of the straight one where it would bend by more
@@ -455,7 +457,8 @@ class _AtStates:
             if np.linalg.norm(scale * ddp) < OPTIONS.bent * np.linalg.norm(scale * dp):
                 p, x = p + 0.5 * ddp, x + 0.5 * ddx
         there = self.data.at(p, x, here.units)
-        return Tried(there, self._decrease(there, 1.0, np.zeros(len(x), bool)), damping)
+        decrease = self._decrease(there, 1.0, np.zeros(len(x), bool))
+        return Tried(_Ahead(there), decrease, damping)
 
     def _decrease(self, there: _Iterate, share: float, stays: np.ndarray) -> float:
         """Decrease of the cost by this share of a step, or of the defects while they matter: of
@@ -506,31 +509,33 @@ class _AtStates:
         stays[better] = False
         return self.data.mixed(there, other, better), stays
 
-    def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
+    def moved(self, there: _Ahead, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
         where it gained little and, where the noise is estimated, that is the same."""
         before, best, least = self.here, self.best, self.data.least
+        after, straightened = there
         if self._apart:
-            gained, most = before.merits - there.merits, OPTIONS.closed**2 * there.x[0].size
+            gained, most = before.merits - after.merits, OPTIONS.closed**2 * after.x[0].size
             cost = before.merits - before.gaps / OPTIONS.defect**2
-            ended = (before.gaps <= most) & (there.open == 0)
+            ended = (before.gaps <= most) & (after.open == 0)
             ended &= gained <= self.data.tolerance * cost
             moving = self.moving[~(ended | (gained <= 0))[self.moving]]
-            return _AtStates(self.data, there, there, moving), bool(ended.all())
-        settled = self.closed(before) and self.closed(there)
-        settled &= before.merit - there.merit <= self.data.tolerance * before.cost
-        here = there
+            return _AtStates(self.data, after, after, moving), bool(ended.all())
+        settled = self.closed(before) and self.closed(after)
+        settled &= before.merit - after.merit <= self.data.tolerance * before.cost
+        here = after
         if least is not None:
-            best = here = there.rescaled(self._rows, least)
-            sigma = there.units.sigma
+            best = here = after.rescaled(self._rows, least)
+            sigma = after.units.sigma
             settled &= bool(np.allclose(here.units.sigma, sigma, rtol=OPTIONS.settled, atol=0))
         elif self.closed(here) and (not self.closed(best) or here.merit < best.merit):
             best = here
-        short = before.merit - there.merit < OPTIONS.short * self.promised
+        short = before.merit - after.merit < OPTIONS.short * self.promised
         bends = short and self.closed(before) and isinstance(self.data.model, Stepping)
-        after = dataclasses.replace(self, here=here, best=best, bends=self.bends or bends)
-        settled = settled and after.promised <= self.data.tolerance * here.cost
-        return after, settled or not np.isfinite(here.cost)
+        bends = (self.bends or bends) and not straightened
+        problem = dataclasses.replace(self, here=here, best=best, bends=bends)
+        settled = settled and problem.promised <= self.data.tolerance * here.cost
+        return problem, settled or not np.isfinite(here.cost)
 
     @cached_property
     def promised(self) -> float:
@@ -563,6 +568,13 @@ class _AtStates:
             iterations,
             converged and bool(finite),
         )
+
+
+class _Ahead(NamedTuple):
+    """The end of a step; straightened: one that is straight since all that bend had failed."""
+
+    iterate: _Iterate
+    straightened: bool = False
 
 
 def _replaced(arcs: np.ndarray, every: np.ndarray, some: np.ndarray) -> np.ndarray:
