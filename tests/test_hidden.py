@@ -13,10 +13,12 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Counted
-from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.errors import FitError, InputError, OutOfTime
 from gfnn_jax.models.lagrangians import hidden
+from gfnn_jax.models.lagrangians.fit import ArcProblem
 from gfnn_jax.models.lagrangians.hidden import with_hidden, with_number
 from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.starts import misfit
 from gfnn_jax.signals.oscillations import Oscillations, oscillations
 
 STEP = 0.025
@@ -70,9 +72,12 @@ def test_a_tone_of_stronger_oscillations_stands_behind_a_weaker_oscillation():
     strong = np.exp(-0.02 * t) * np.cos(3.5 * t - 2.0 * np.exp(-0.04 * t))
     y = strong + 0.5 * np.cos(4.4 * t) + 0.12 * np.cos(2.6 * t + 1) + 0.06 * np.cos(1.9 * t)
     y += 1e-3 * np.random.default_rng(0).normal(size=len(t))
-    first, second, *_ = oscillations(t, y, 3)
+    first, second, *_, between, above, below = oscillations(t, y, 3)
     np.testing.assert_allclose(first.omega, [1.9, 3.5, 4.4], atol=0.05)
     np.testing.assert_allclose(second.omega, [2.6, 3.5, 4.4], atol=0.05)
+    np.testing.assert_allclose(between.omega, [3.5, np.sqrt(3.5 * 4.4), 4.4], atol=0.05)
+    np.testing.assert_allclose(above.omega, [3.5, 4.4, 1.5 * 4.4], atol=0.05)  # that none shows
+    np.testing.assert_allclose(below.omega, [3.5 / 1.5, 3.5, 4.4], atol=0.05)
 
 
 @dataclasses.dataclass
@@ -166,17 +171,56 @@ def test_any_two_modes_may_rub_on_each_other(monkeypatch):
     x = np.cos(1.3 * t) + np.cos(2.9 * t) + np.cos(4.1 * t)
     recording = with_hidden(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[]), 2)
     problem = samples_of(recording).problem
+    monkeypatch.setattr(ArcProblem, "fit", lambda problem, structure, *others, **known: structure)
+    (found, *_) = oscillations(t, x, 3)
+    tried: Any = hidden._of_modes(hidden._from(problem, found), (4,))
+    matrices = [np.outer(c, c).ravel() for c, *_ in tried.friction]
+    assert np.linalg.matrix_rank(matrices) == 6
+
+
+def test_starts_that_leave_noise_alone_are_followed_first(monkeypatch):
+    """Those of other sets follow, the best first; then the best sets are tried with all powers."""
+    t = STEP * np.arange(1_200)
+    x = np.cos(1.3 * t) + np.cos(2.9 * t) + np.cos(4.1 * t)
+    recording = with_hidden(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[]), 2)
+    problem, left = samples_of(recording).problem, [3.0, np.inf, 1.05, 20.0, 1.5, 4.0]
+    monkeypatch.setattr(hidden, "oscillations", lambda *_: range(6))
+    monkeypatch.setattr(hidden, "_from", lambda _, one: one)
+    monkeypatch.setattr(hidden, "misfit", lambda fit: left[fit[0]])
     tried = []
 
-    def again(fit, structure, *others, **known):
-        tried.append(structure)
-        return fit
+    def of_modes(one, degrees):
+        tried.append((one, degrees))
+        if one == 1:
+            raise OutOfTime
+        return one, degrees
 
-    monkeypatch.setattr(hidden.LawFit, "again", again)
-    (found, *_) = oscillations(t, x, 3)
-    list(hidden._of_modes(hidden._from(problem, found)))
-    matrices = [np.outer(c, c).ravel() for c, *_ in tried[0].friction]
-    assert np.linalg.matrix_rank(matrices) == 6
+    monkeypatch.setattr(hidden, "_of_modes", of_modes)
+    starts = hidden._starts(problem, Counted(np.inf))
+    assert next(starts) == (2, (4,))
+    assert len(tried) == 3
+    assert [*starts] == [(k, (4,)) for k in (4, 0, 5)] + [(k, (3, 4)) for k in (2, 4, 0)]
+    assert len(tried) == 9
+
+
+@pytest.mark.slow
+def test_modes_whose_frequencies_depend_on_the_swings_are_found():
+    """Three carts on cubic springs, one mode much smaller than the others: by linear modes its
+    frequency became that of another, and no law followed."""
+    rng = np.random.default_rng([*b"two: three carts", 304])
+    m, rubs = np.append(1.0, rng.uniform(0.7, 2.0, 2)), rng.uniform(0.005, 0.05, 3)
+    k, cubic, own = rng.uniform(2, 10, 2), rng.uniform(1, 6, 2), rng.uniform(2.5, 10, 3)
+
+    def rates(_, s):
+        apart = np.diff(s[:3])
+        pull = np.pad(k * apart + cubic * apart**3, 1)
+        return [*s[3:], *((np.diff(pull) - own * s[:3] - rubs * s[3:]) / m)]
+
+    start, t = [1.0, *rng.uniform(-0.8, 0.8, 2), 0.0, 0.0, 0.0], 0.02 * np.arange(1_800)
+    x = solve_ivp(rates, (0, t[-1]), start, t_eval=t, rtol=1e-10, atol=1e-12).y[0]
+    x += 1e-3 * x.std() * rng.normal(size=len(t))
+    recording = with_hidden(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[]), 2)
+    assert misfit(hidden.search_hidden(samples_of(recording).problem).fit) < 1.1
 
 
 @pytest.mark.slow

@@ -24,7 +24,8 @@ class _Options:
     weak: float = 2e-3  # its size beside the strongest
     # size beside a stronger one, below which a line may be its tone, or come of how that changes
     imitated: float = 0.5
-    sets: int = 3  # that are told
+    sets: int = 3  # that are told, of lines
+    apart: float = 1.5  # ratio to the slowest or fastest, of one that no line shows
 
 
 class Oscillations(NamedTuple):
@@ -70,7 +71,8 @@ def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]
     has fewer.
 
     They are of the strongest of its oscillations, first of those that no stronger ones make (tones
-    at ±a ± b ± c come of powers of degree 4), then each with a weaker one for its last.
+    at ±a ± b ± c come of powers of degree 4), then each with a weaker one for its last, or with one
+    that no line shows: between these, above or below them.
     """
     known = np.isfinite(y)
     if known.sum() < _Options.fewest * max(count, FEWEST):
@@ -84,8 +86,11 @@ def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]
         made = side or any(abs(sum(three) - omega) < width for three in tones)
         (others if made else own).append((size, omega))
     ranked = [omega for _, omega in (*own, *others)]
-    ends = ranked[count - 1 :][: _Options.sets]
-    return [Oscillations(np.sort([*ranked[: count - 1], end])) for end in ends]
+    ends, strong = ranked[count - 1 :][: _Options.sets], np.sort(ranked[: count - 1])
+    if ends:
+        between = np.sqrt(strong[1:] * strong[:-1])
+        ends += [*between, _Options.apart * strong[-1], strong[0] / _Options.apart]
+    return [Oscillations(np.sort([*strong, end])) for end in ends]
 
 
 def _lines(t: np.ndarray, y: np.ndarray) -> tuple[list[tuple[float, float]], float]:

@@ -47,9 +47,11 @@ class HiddenOptions:
     periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
     modes, first of forces that are odd, as of most springs, then of all where these leave more than
     noise. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
-    swings, times those that are seen, that are tried. finished: starts that are followed on.
+    swings, times those that are seen, that are tried. finished: starts that are followed on, and
+    sets of oscillations that are tried with all powers.
     damped: of the critical friction, at the start. most: numbers of steps and of their derivatives
-    that a search may take, about as many as any whose law was right.
+    that a search may take, about as many as any whose law was right; each: that one start of modes
+    may.
     """
 
     periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
@@ -59,6 +61,7 @@ class HiddenOptions:
     finished: int = 3
     damped: float = 0.003
     most: float = 5e8
+    each: float = 4e7
 
 
 OPTIONS = HiddenOptions()
@@ -179,23 +182,22 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     Raises FitError where no start follows the arcs to some times their noise, or to the noise.
     """
     most = STARTS.followed if problem.options.partly else STARTS.noise
-    longest = max(problem.nodes, key=lambda n: len(n.t))
     cap, found = Counted(OPTIONS.most), list[LawFit]()
     capped = dataclasses.replace(problem, allowance=Allowance(cap=cap))
-    sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
     with contextlib.suppress(OutOfTime):
-        for start in (fit for one in sets for fit in _along_short_arcs(_from(capped, one))):
-            fit = _along_longer_arcs(start)
+        for start in _starts(capped, cap):
+            fit = _along_longer_arcs(start, most)
             problem.on_progress(f"from oscillations: {fit}")
             if misfit(fit) < most:
                 found.append(fit)
-                if misfit(fit) < STARTS.noise:
+                if misfit(fit) < STARTS.white:
                     break
     if not found:
         raise no_hidden_law(problem.dim - 1, after=_spent(cap))
     best = min(found, key=misfit)
     fewer = partial(TermSearch(best.structure, None).prune, best)
     fit = within(contextlib.nullcontext(), fewer) or best
+    fit = fit if misfit(fit) < most else best  # a mass below zero, say
     sensor = _following(fit)
     observation = dataclasses.replace(fit.problem.observation, formulas=(sensor,))
     freed = {"allowance": problem.allowance, "observation": observation}
@@ -240,29 +242,59 @@ def _sensor_of(problem: ArcProblem) -> Hidden:
     return sensor
 
 
-def _along_short_arcs(problem: ArcProblem) -> Iterator[LawFit]:
-    """The best starts along short arcs; again where a fit that does not follow them yet has not
+def _starts(problem: ArcProblem, cap: Counted) -> Iterator[LawFit]:
+    """Starts along short arcs, from each set of oscillations: of modes those that leave noise alone
+    as soon as they are found, then the best of the others; first with odd forces, then, from the
+    best sets, with all."""
+    longest = max(problem.nodes, key=lambda n: len(n.t))
+    found = oscillations(longest.t, longest.y[:, 0], problem.dim)
+    sets = [_from(problem, one) for one in found]
+    if problem.angles:
+        yield from (fit for one in sets for fit in _best_pendulums(one))
+        return
+    for degrees in OPTIONS.degrees:
+        left, others = np.full(len(sets), np.inf), list[LawFit]()
+        for k, one in enumerate(sets):
+            fit = within(_at_most(cap, OPTIONS.each), partial(_of_modes, one, degrees))
+            if fit is None:
+                continue
+            left[k] = misfit(fit)
+            if left[k] < STARTS.white:
+                yield fit
+            elif left[k] < STARTS.followed:
+                others.append(fit)
+        yield from sorted(others, key=misfit)[: OPTIONS.finished]
+        sets = [sets[k] for k in np.argsort(left)[: OPTIONS.finished]]
+
+
+@contextlib.contextmanager
+def _at_most(cap: Counted, operations: float) -> Iterator[None]:
+    """Context in which a search takes no more than so many of its operations."""
+    most, cap.most = cap.most, min(cap.most, cap.spent + operations)
+    try:
+        yield
+    finally:
+        cap.most = most
+
+
+def _best_pendulums(problem: ArcProblem) -> Iterator[LawFit]:
+    """The best starts of pendulums; again where a fit that does not follow short arcs yet has not
     converged. Longer arcs, which tell more, converge sooner."""
-    fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
-    for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
+    for fit in sorted(_of_pendulums(problem), key=misfit)[: OPTIONS.finished]:
         yield fit if misfit(fit) < STARTS.followed or fit.fitted.converged else fit.again()
 
 
-def _along_longer_arcs(fit: LawFit) -> LawFit:
-    """A start along longer and longer arcs, as far as it follows them, with all powers from where
-    those it has leave more than noise."""
+def _along_longer_arcs(fit: LawFit, most: float) -> LawFit:
+    """A start along longer and longer arcs, as far as it follows them to ``most`` times the noise,
+    or may do so once it converges."""
     lengths = map(fit.problem.length, fit.problem.options.periods[1:])
     for length in [n for n in lengths if n > fit.arcs.t.shape[1]]:
-        if misfit(fit) > STARTS.followed:  # along longer arcs it would leave more
+        if misfit(fit) > (most if fit.fitted.converged else STARTS.followed):
             break
         if (longer := to_longer_arcs(fit, length)) is None:
             break
         fit = longer
-    richer = _with_powers(fit, OPTIONS.degrees[-1])
-    if fit.problem.angles or misfit(fit) < STARTS.white or len(richer) == len(fit.structure.terms):
-        return fit
-    other = fit.again(dataclasses.replace(fit.structure, terms=richer))
-    return _along_longer_arcs(other) if misfit(other) < misfit(fit) else fit
+    return fit
 
 
 class _Shape(NamedTuple):
@@ -282,46 +314,28 @@ def _started(problem: ArcProblem, shapes: np.ndarray) -> ArcProblem:
     return dataclasses.replace(problem, nodes=nodes)
 
 
-def _of_modes(problem: ArcProblem) -> list[LawFit]:
-    """Short arcs fitted by modes of small swings, and then with powers that couple them."""
+def _of_modes(problem: ArcProblem, degrees: Iterable[int]) -> LawFit:
+    """Short arcs fitted by modes of small swings, and powers of these degrees that couple them, all
+    at once: by modes alone two of the frequencies become one where they depend on the swings."""
     sensor, d = _sensor_of(problem), problem.dim
-    none, omega = (0,) * d, sensor.omega
+    none = (0,) * d
     masses = [(libraries.unit(d, i, i), none, none, 0.0) for i in range(d)]
     springs = [(none, libraries.unit(d, i, i), none, 0.0) for i in range(d)]
+    powers = [
+        (none, libraries.unit(d, *axes), none, 0.0)
+        for degree in degrees
+        for axes in combinations_with_replacement(range(d), degree)
+    ]
     # by relative speeds of any two: modes have no neighbours
     pairs = [tuple((b - a).tolist()) for a, b in combinations(np.eye(d, dtype=int), 2)]
     friction = tuple(libraries.losses(d, (LINEAR,), 0.0, joints=pairs))
-    linear = Structure(d, (*masses, *springs), friction[:d], (), 0, problem.sensors)
-    known: dict[Key, float] = {
-        ("term", row): -0.5 * w**2 for row, w in zip(springs, omega, strict=True)
-    }
-    known |= {("loss", row): OPTIONS.damped * w for row, w in zip(friction[:d], omega, strict=True)}
+    known: dict[Key, float] = {("term", row): 0.5 for row in masses}
+    for spring, loss, w in zip(springs, friction[:d], sensor.omega, strict=True):
+        known |= {("term", spring): -0.5 * w**2, ("loss", loss): OPTIONS.damped * w}
+    structure = Structure(d, (*masses, *springs, *powers), friction, (), 0, problem.sensors)
     problem = _started(problem, np.eye(d))
-    arcs, sigma = problem.arcs(problem.options.periods[0]), problem.scales.sigma
-    plain = problem.fit(linear, known, arcs, sigma, rescale=False)
-    values = {**plain.values, **{("term", row): 0.5 for row in masses}}
-    rich = plain
-    for degrees in OPTIONS.degrees:
-        terms = _with_powers(rich, degrees)
-        whole = dataclasses.replace(linear, terms=terms, friction=friction)
-        rich = rich.again(whole, {**values, **rich.values}, rescale=False)
-        if misfit(rich) < STARTS.noise:
-            break
-    # With their powers three modes follow short arcs of what they move, and of little else.
-    if d > 2 and min(misfit(rich), misfit(plain)) > STARTS.followed:
-        return []
-    return [fit for fit in (rich, plain) if fit.follows][:1]
-
-
-def _with_powers(fit: LawFit, degrees: Iterable[int]) -> tuple[Row, ...]:
-    """The terms of a fit, and the powers of modes, alone and together, of these degrees."""
-    none, own = (0,) * fit.problem.dim, fit.structure.terms
-    powers = (
-        (none, libraries.unit(fit.problem.dim, *axes), none, 0.0)
-        for degree in degrees
-        for axes in combinations_with_replacement(range(fit.problem.dim), degree)
-    )
-    return (*own, *(row for row in powers if row not in own))
+    arcs = problem.arcs(problem.options.periods[0])
+    return problem.fit(structure, known, arcs, problem.scales.sigma, rescale=False)
 
 
 def _of_pendulums(problem: ArcProblem) -> list[LawFit]:

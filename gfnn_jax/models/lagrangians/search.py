@@ -371,16 +371,16 @@ class TermSearch:
 
         def without(fit: LawFit, key: Key) -> LawFit | None:
             z, smaller = fit.significance[key], fit.structure.without({key})
-            doubtful = z > evidence.nothing or (key[0] == "loss" and z >= 0)
-            if doubtful and Comparison.of(fit.costs, fit.cross_validate(smaller)).is_lower(
-                evidence.gain
-            ):
-                return None
             less = fit.again(smaller)
             if not _leaves_little_more(less, fit):
                 return None  # the others take no orbit to where they would make up for it
             if fit.fitted.converged and not less.fitted.converged:
                 return None  # without it others are not determined
+            doubtful = z > evidence.nothing or (key[0] == "loss" and z >= 0)
+            if doubtful and Comparison.of(fit.costs, fit.cross_validate(smaller)).is_lower(
+                evidence.gain
+            ):
+                return None
             _dropped(fit, key, f"{z:.1f} standard errors")
             return less
 
