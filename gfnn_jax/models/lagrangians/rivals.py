@@ -83,7 +83,7 @@ class Options:
     first: float = 0.3
     close: float = 1e-3
     beyond: float = 4.0
-    near: float = 4.0
+    near: float = 8.0
     apart: float = 1e-4
     imitated: float = 1e-4
     corrections: int = 6
