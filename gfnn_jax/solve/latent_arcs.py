@@ -464,7 +464,9 @@ class _AtStates:
         """Decrease of the cost by this share of a step, or of the defects while they matter: of
         those of arcs but for the ones that stay (A,) where they are."""
         if self.closed(self.here):
-            return self.here.merit * (1 + 1e-9) - there.merit
+            # Roundoff may hide what the last steps gain; others that gain nothing have failed.
+            last = self.promised <= self.data.tolerance * self.here.cost
+            return self.here.merit * (1 + 1e-9 * last) - there.merit
         if not np.isfinite(there.gap):
             return -np.inf
         before, after = (np.sqrt(np.sum(at.gaps[~stays])) for at in (self.here, there))
