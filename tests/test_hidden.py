@@ -14,7 +14,9 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Counted
 from gfnn_jax.errors import FitError, InputError, OutOfTime
-from gfnn_jax.models.lagrangians import hidden
+from gfnn_jax.families.friction import LINEAR
+from gfnn_jax.fitting.evidence import EVIDENCE
+from gfnn_jax.models.lagrangians import hidden, recordings
 from gfnn_jax.models.lagrangians.fit import ArcProblem
 from gfnn_jax.models.lagrangians.hidden import with_hidden, with_number
 from gfnn_jax.models.lagrangians.recordings import samples_of
@@ -268,3 +270,18 @@ def test_a_cart_tells_another_on_a_cubic_spring():
     assert fit.law.sensors["x_rest"][0] == pytest.approx(0.3, abs=1e-3)
     off = fit.map.forecast(recording, t[~seen]).values["x"][0] - 0.3 - true[0, ~seen]
     assert np.sqrt(np.mean(off**2)) < 2e-3 * true[0].std()
+
+
+@pytest.mark.parametrize(("negative", "gains"), [(0.0, False), (-1e-3, False), (-1e-2, True)])
+def test_friction_that_feeds_some_motion_is_no_law(negative, gains):
+    """Of two modes: of their relative speed, which their sum does not feel, and of the first."""
+    rows = [((1, -1), LINEAR, 0.0), ((1, 0), LINEAR, 0.0)]
+    keys = [("loss", row) for row in rows]
+    fit = Some(
+        structure=Some(keys=lambda: keys),
+        values=dict(zip(keys, (0.3, negative), strict=True)),
+        form=Some(dim=2),
+        linearised=Some(covariance=1e-6 * np.eye(2)),
+        problem=Some(options=Some(evidence=EVIDENCE)),
+    )
+    assert recordings._gains_energy(fit) == gains

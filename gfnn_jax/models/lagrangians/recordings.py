@@ -388,7 +388,8 @@ def _gains_energy(fit: LawFit) -> bool:
     power = np.linalg.eigh(along.T @ (values[:, None] * along))
     share = (along @ power.eigenvectors[:, 0]) ** 2
     error = np.sqrt(share @ fit.linearised.covariance[np.ix_(own, own)] @ share)
-    return bool(power.eigenvalues[0] < -fit.problem.options.evidence.significant * error)
+    rounding = 1e-9 * abs(power.eigenvalues).max()  # of friction that some motion does not feel
+    return bool(power.eigenvalues[0] < -fit.problem.options.evidence.significant * error - rounding)
 
 
 def _nature(data: RecordingData) -> Nature:
