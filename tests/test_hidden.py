@@ -272,16 +272,16 @@ def test_a_cart_tells_another_on_a_cubic_spring():
     assert np.sqrt(np.mean(off**2)) < 2e-3 * true[0].std()
 
 
-@pytest.mark.parametrize(("negative", "gains"), [(0.0, False), (-1e-3, False), (-1e-2, True)])
-def test_friction_that_feeds_some_motion_is_no_law(negative, gains):
-    """Of two modes: of their relative speed, which their sum does not feel, and of the first."""
-    rows = [((1, -1), LINEAR, 0.0), ((1, 0), LINEAR, 0.0)]
-    keys = [("loss", row) for row in rows]
+@pytest.mark.parametrize(("own", "gains"), [((), False), ((-1e-3,), False), ((-1e-2,), True)])
+def test_friction_that_feeds_some_motion_is_no_law(own, gains):
+    """Of relative speeds of three modes, which all of them together do not feel, and of one."""
+    rows = [((1, -1, 0), LINEAR, 0.0), ((0, 1, -1), LINEAR, 0.0), ((1, 0, 0), LINEAR, 0.0)]
+    keys = [("loss", row) for row in rows[: 2 + len(own)]]
     fit = Some(
         structure=Some(keys=lambda: keys),
-        values=dict(zip(keys, (0.3, negative), strict=True)),
-        form=Some(dim=2),
-        linearised=Some(covariance=1e-6 * np.eye(2)),
+        values=dict(zip(keys, (0.77, 0.2, *own), strict=True)),
+        form=Some(dim=3),
+        linearised=Some(covariance=1e-6 * np.eye(len(keys))),
         problem=Some(options=Some(evidence=EVIDENCE)),
     )
     assert recordings._gains_energy(fit) == gains
