@@ -79,11 +79,13 @@ def test_the_flow_obeys_the_equations_of_motion():
         ]
     )
     family, params = family_of(LAW)
-    state = Legendre(TERMS).state
     piece = Flow(family, params, 0.1, np.ones(4), 8, 4)
-    expected = state(THETA, there[:, :2], there[:, 2:])
-    np.testing.assert_allclose(piece.image(state(THETA, q, v), u), expected, atol=1e-11)
-    found, _ = jax.jit(Flow.step)(piece, state(THETA, q, v), u)
+    here, expected = (
+        np.concatenate([a, LAW.momentum(a, b)], axis=1)
+        for a, b in ((q, v), np.split(there, 2, axis=1))
+    )
+    np.testing.assert_allclose(piece.image(here, u), expected, atol=1e-11)
+    found, _ = jax.jit(Flow.step)(piece, here, u)
     np.testing.assert_allclose(found, expected, atol=1e-11)
 
 

@@ -23,7 +23,7 @@ def test_a_wider_swing_tells_what_a_small_one_cannot():
     best = fit.next_motions[0]
     assert best.start["theta"] > 0.6
     assert best.gains["cos(2*theta)"] > 5
-    at = f"theta = {best.start['theta']:.3g} rad, read every {best.interval:.3g} s. Standard"
+    at = f"theta = {best.start['theta']:.3g} rad, read every {best.interval:.3g} s"
     assert f"release from rest at {at}" in fit.table
     both = gfnn.fit(recorded(0.3, best.start["theta"]), terms=TERMS)
     before, after = (f.lagrangian.terms[2].std for f in (fit, both))
