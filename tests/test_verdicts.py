@@ -204,6 +204,13 @@ def test_a_record_is_named_for_what_it_is(make, verdict):
     assert nature(found, measure(found), ()).verdict.startswith(verdict)
 
 
+def test_a_walk_on_a_wave_is_not_explained_to_the_noise():
+    steps = np.random.default_rng(3).normal(size=800)
+    x = 0.1 * np.cumsum(steps) + np.sin(0.05 * np.arange(800))
+    found = stretches(gfnn.Recording({"t": np.arange(800.0), "x": x}, positions=["x"]))
+    assert "to the noise" not in nature(found, measure(found), ()).reason
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_small_unrecorded_force_leaves_the_gain_of_an_input(seed):

@@ -42,7 +42,8 @@ class Options:
     accelerations, of a law that may be one in part. real: share of their squares that is no noise.
     most: share of the squares of second differences in narrow peaks, which fall to a quarter within
     ``width`` samples. closed: squares of the accelerations that are left, in those of noise; bias:
-    the share that these are at least, by the curves' own bias.
+    the share that these are at least, by the curves' own bias; told: of what is no noise, that is
+    explained then.
     excited: negative friction, in ω. turns: passages through the mean of what oscillates; lasts:
     ratio of its spreads, later and before, of what sustains itself. memory: share that it
     explains; gains, beats: of what polynomials and past positions leave, that they leave;
@@ -63,6 +64,7 @@ class Options:
     most: float = 0.7
     width: int = 5
     closed: float = 5.0
+    told: float = 0.5
     bias: float = 1e-4
     excited: float = 0.1
     turns: int = 4
@@ -161,7 +163,8 @@ def nature(
         "self-excited: friction is negative where motion is slow, or small, "
         f"{rate:.2g} 1/s, and feeds the energy that faster or larger motion loses",
     )
-    if 1 - plain < Options.closed * max(1 - real, Options.bias):
+    closed = 1 - plain < Options.closed * max(1 - real, Options.bias)
+    if closed and plain > Options.told * real:  # of much noise any share would be close to it
         if excited:
             return self_excited
         return Nature(
