@@ -281,6 +281,17 @@ def test_wrong_values_are_left_out_of_a_fit_and_told(kind):
         assert named in found.messages[0]
 
 
+def test_samples_of_a_sensor_at_its_limit_are_left_out_of_a_fit_and_told():
+    t, x = pendulum(end=20.0)
+    with pytest.warns(
+        gfnn.FitWarning, match=r"theta saturates at 0.8 rad: .* samples in 4 stretch"
+    ):
+        found = gfnn.fit(recorded(t, np.minimum(x, 0.8)))
+    assert found.verdict == "identified"
+    (_, gravity), _ = found.lagrangian.terms, found.friction.terms
+    assert abs(gravity.coefficient - 2) < 4 * gravity.std < 0.02
+
+
 @pytest.mark.slow
 def test_a_driven_mass_has_a_law_of_one_term():
     """ẍ = u − ẋ/2: no coefficient of L is free."""

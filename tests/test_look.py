@@ -255,6 +255,23 @@ def test_wrong_values_are_told_with_run_and_time_and_left_out_of_the_figures():
     assert found.gaps == ()
 
 
+def test_a_limit_is_told_from_a_body_that_is_held_or_comes_to_rest():
+    t = 0.02 * np.arange(400)
+    noise = 1e-4 * np.random.default_rng(0).standard_normal((2, len(t)))
+    held = np.where(t < 0.5, 1.0, np.cos(3 * (t - 0.5)))  # let go from the same place
+    free = {"swing": np.cos(3 * t) + noise, "held": [held] * 2, "rest": [np.exp(-3 * t)] * 2}
+    limited = np.clip(free["swing"], -0.7, 0.9)
+    at_limit = (limited == -0.7) | (limited == 0.9)
+    for name, runs, gone in [(n, x, np.zeros((2, 400), bool)) for n, x in free.items()] + [
+        ("limited", limited, at_limit)
+    ]:
+        runs = [{"t": t, "x": np.round(x, 5)} for x in runs]
+        kept, lines = without_wrong_values(gfnn.Recording(runs, positions="x"))
+        missing = [np.isnan(kept.values("x", run)) for run in kept.runs]
+        np.testing.assert_array_equal(missing, gone, err_msg=name)
+        assert lines == () or "x saturates at -0.7 and 0.9: " in lines[0]
+
+
 def test_wrong_values_are_missing_where_they_are_left_out():
     wrong, clean = two_carts(), two_carts(wrong=False)
     kept, lines = without_wrong_values(wrong)

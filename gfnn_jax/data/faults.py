@@ -30,7 +30,7 @@ from gfnn_jax.signals.wrong_values import TURN
 
 WRONG = (
     *("constant", "repeated", "order", "time unit", "no derivative", "degrees", "sign", "factor"),
-    *("wrapped", "interpolated jump", "clipped", "drifting clock", "different systems", "circle"),
+    *("wrapped", "interpolated jump", "drifting clock", "different systems", "circle"),
     "first order",
 )
 PROPOSED = ("kind", "let go", "caught", "rounded times", "roles")
@@ -42,7 +42,6 @@ class _Options:
 
     wide: float = 0.75 * np.pi  # rad: step of an angle that may as well be one the other way round
     swing: float = 2 * TURN  # beyond which the unit of an angle that swings is doubted
-    flat: int = 3  # equal extremes in a row that a sensor's limit makes
     drift: float = 5e-3  # relative change of the step over a run
     derivative: float = 0.8  # of a velocity's variance, that the position's derivative explains
     better: float = 0.25  # score by which other pairs of columns are better than the declared ones
@@ -116,35 +115,6 @@ def _repeated(traits: Traits) -> Iterator[Fault]:
             yield Fault("repeated", found, f"Leave {other} out")
 
 
-def _clipped(traits: Traits) -> Iterator[Fault]:
-    """Columns that stay at their very extreme, entering it by steps that a smooth turn has not."""
-    recording = traits.recording
-    for name in (*recording.positions, *recording.velocities):
-        low, high = traits.range(name)
-        if name in recording.angles and high - low > 0.95 * TURN:
-            continue
-        spread = float(np.nanstd(traits.columns[name]))
-        least = max(4 * (traits.resolution[name] or 0.0), 1e-9 * spread)
-        for extreme in (low, high):
-            count = sum(_flats(x, extreme, least) for x in traits.by_run(name))
-            if count > 1:
-                shown = f"{extreme / recording.factors[name]:.6g} {recording.unit(name)}".rstrip()
-                found = f"{name} saturates: {count} times it stays at its extreme, {shown}"
-                remedy = "Leave these samples out: --from, --to, or NaN in them"
-                yield Fault("clipped", found, remedy)
-
-
-def _flats(x: np.ndarray, extreme: float, step: float) -> int:
-    """Stretches of equal extremes whose neighbours are more than a step away."""
-    at = np.concatenate([[False], x == extreme, [False]])
-    begins, ends = np.flatnonzero(at[1:] & ~at[:-1]), np.flatnonzero(~at[1:] & at[:-1])
-    count = 0
-    for begin, end in zip(begins, ends, strict=True):
-        sides = [abs(x[k] - extreme) for k in (begin - 1, end) if 0 <= k < len(x)]
-        count += int(end - begin >= _Options.flat and max(sides, default=0.0) > step)
-    return count
-
-
 def _missing(traits: Traits) -> Iterator[Fault]:
     recording = traits.recording
     for name in recording.columns:
@@ -159,10 +129,10 @@ def _missing(traits: Traits) -> Iterator[Fault]:
 
 
 def _wrong_values(traits: Traits) -> Iterator[Fault]:
-    """Sensors that repeat one value while the motion goes on, and samples far from where those
-    around them lead."""
+    """Sensors at their limit, or that repeat one value while the motion goes on, and samples far
+    from where those around them lead."""
     told = [in_words(traits.recording, name, of) for name, of in traits.wrong.items()]
-    for kind in ("stuck", "outliers"):
+    for kind in ("clipped", "stuck", "outliers"):
         yield from (Fault(kind, one[kind], "Left out of a fit") for one in told if kind in one)
 
 
@@ -470,7 +440,7 @@ def _of_other_systems(traits: Traits) -> list[str]:
 
 
 _CHECKS = (
-    *(_constant, _repeated, _related, _units_of_angles, _wraps, _interpolated_jumps, _clipped),
+    *(_constant, _repeated, _related, _units_of_angles, _wraps, _interpolated_jumps),
     *(_time_units, _drifting, _systems, _missing, _wrong_values, _coarse),
     lambda traits: (Fault("reading", note) for note in traits.recording.notes),
 )

@@ -253,7 +253,7 @@ def _column(known: Traits, name: str, doubted: frozenset[str]) -> Column:
     turns = name in {*recording.angles} - doubted and np.ptp(known.range(name)) > 2 * np.pi
     shown = np.sin(values) if turns else values  # whose spectrum tells frequencies
     wrong = known.wrong.get(name, ())
-    stuck = [sum(len(w.rows) for w in wrong if (w.off is None) == held) for held in (False, True)]
+    stuck = [sum(len(w.rows) for w in wrong if w.kind == kind) for kind in ("outliers", "stuck")]
     return Column(
         name,
         role,

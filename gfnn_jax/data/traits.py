@@ -13,7 +13,7 @@ from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives, win
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
-from gfnn_jax.signals.wrong_values import WrongValues, wrong_at_jumps, wrong_values
+from gfnn_jax.signals.wrong_values import TURN, WrongValues, clipped, wrong_at_jumps, wrong_values
 
 
 class _Options:
@@ -24,6 +24,7 @@ class _Options:
     block: int = 8  # windows fitted or judged together
     ridge: float = 1e-8  # of the fits, relative to columns of unit size
     ignored: int = 8  # columns without a role that are looked at, at most
+    whole_turn: float = 0.95  # of a turn, within which a wrapped angle has extremes of its own
     gone: float = 0.5  # of the rows; where more lack a position, columns take turns: all rows count
 
 
@@ -119,9 +120,13 @@ def _rows(gone: np.ndarray) -> np.ndarray:
 
 
 def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
-    """The wrong values of each position, sensor and input, by name."""
+    """The wrong values of each position, velocity, sensor and input, by name."""
     times = [recording.times(run) for run in recording.runs]
     found = {}
+    limited = {n: _clipped(recording, n) for n in (*recording.positions, *recording.velocities)}
+    limited = {name: stretches for name, stretches in limited.items() if stretches}
+    rows = {n: np.concatenate([one.rows for one in of]) for n, of in limited.items()}
+    recording = recording.without(rows)
     for name in (*recording.positions, *recording.sensors):
         parts, smallest = recording.each(recording.unwrapped, name), _resolution(recording, name)
         found[name] = wrong_values(times, parts, smallest)
@@ -133,7 +138,22 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
     for name in recording.inputs:
         parts = recording.each(recording.values, name)
         found[name] = wrong_at_jumps(times, parts, _resolution(recording, name))
+    for name, stretches in limited.items():
+        found[name] = tuple(
+            sorted([*found.get(name, ()), *stretches], key=lambda wrong: wrong.rows[0])
+        )
     return found
+
+
+def _clipped(recording: Recording, name: str) -> tuple[WrongValues, ...]:
+    """The stretches in which a column stays at its limit; none of an angle that turns over."""
+    parts = recording.each(recording.unwrapped, name)
+    known = np.concatenate(parts)
+    known = known[np.isfinite(known)]
+    turns = len(known) and np.ptp(known) > _Options.whole_turn * TURN
+    if name in recording.angles and turns:
+        return ()
+    return clipped(parts, _resolution(recording, name))
 
 
 def _resolution(recording: Recording, name: str) -> float | None:
@@ -149,18 +169,23 @@ def without_wrong_values(recording: Recording) -> tuple[Recording, tuple[str, ..
 
 
 def in_words(recording: Recording, name: str, wrong: Sequence[WrongValues]) -> dict[str, str]:
-    """The wrong values of a column in a line for each kind, "stuck" or "outliers": how many, where
-    the first ones are."""
+    """The wrong values of a column in a line for each kind of `WrongValues`: how many, where the
+    first ones are."""
     times, found = np.concatenate([recording.times(run) for run in recording.runs]), {}
-    for kind in ("stuck", "outliers"):
-        of_kind = [stretch for stretch in wrong if (stretch.off is None) == (kind == "stuck")]
+    for kind in ("clipped", "stuck", "outliers"):
+        of_kind = [stretch for stretch in wrong if stretch.kind == kind]
         if not of_kind:
             continue
         count, first = sum(len(stretch.rows) for stretch in of_kind), of_kind[0]
         apart = f" in {len(of_kind)} stretches" if 1 < len(of_kind) < count else ""
         run = f" of run {recording.runs[first.run]}" if len(recording.runs) > 1 else ""
         when = f"the first at {times[first.rows[0]]:.6g} s{run}"
-        if kind == "stuck":
+        if kind == "clipped":
+            factor, unit = recording.factors[name], recording.unit(name)
+            limits = sorted({one.limit / factor for one in of_kind if one.limit is not None})
+            shown = f"{' and '.join(f'{one:.6g}' for one in limits)} {unit}".rstrip()
+            found[kind] = f"{name} saturates at {shown}: {count} samples{apart}, {when}"
+        elif kind == "stuck":
             found[kind] = f"{name} is stuck: {count} samples{apart} repeat the one before, {when}"
         else:
             most = max(stretch.off or 0.0 for stretch in of_kind) / recording.factors[name]

@@ -1,4 +1,5 @@
-"""Wrong values of a column: outliers, single or in a row, and stretches of a sensor that was stuck.
+"""Wrong values of a column: outliers, single or in a row, and stretches of a sensor that was stuck
+or at its limit.
 
 *Roughness* is how far samples are from cubics through their four neighbours: noise, a sensor's
 single counts, and what of the motion is not smooth.
@@ -13,6 +14,10 @@ it one that is off by a whole turn: an angle that was not lifted.
 from where it rested, and a coarse sensor shows its turning points by equal values beside which it
 moves by its smallest step. Only a sensor that was stuck while the motion went on catches up in one
 step, with a jump far above the steps around it.
+
+*Clipped*: values that stay at the very extreme of their column, entered or left by a step that a
+smooth turn does not make. A sensor has such a limit where that happens more than once, but for the
+beginnings of runs, where a body may be held (`clipped`).
 
 An input may jump and may be a pulse. What it cannot be is smooth on both sides of a jump, with one
 sample between them that is far beyond either (`wrong_at_jumps`).
@@ -58,6 +63,9 @@ class _Options:
     # At jumps
     smooth: int = 3  # degree of the polynomial of each side
     beyond: float = 0.5  # of the jump, beyond both sides: the overshoot of a real one is less
+    # Clipped
+    flat: int = 3  # equal extremes in a row that a sensor's limit makes
+    entered: float = 4.0  # resolutions: a smooth turn has a shorter step beside its extreme
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,12 +73,20 @@ class WrongValues:
     """A stretch of wrong values of one column.
 
     run: its number. rows: (k,) samples, the runs one after another. off: how far they are from
-    where the samples around them lead; None of a sensor that was stuck.
+    where the samples around them lead; None of a sensor that was stuck or at its ``limit``.
     """
 
     run: int
     rows: np.ndarray
     off: float | None
+    limit: float | None = None
+
+    @property
+    def kind(self) -> str:
+        """ "clipped", "stuck" or "outliers"."""
+        if self.limit is not None:
+            return "clipped"
+        return "stuck" if self.off is None else "outliers"
 
 
 def wrong_values(times: Runs, runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
@@ -89,6 +105,34 @@ def wrong_values(times: Runs, runs: Runs, resolution: float | None) -> tuple[Wro
         for begin, end, off in _outliers(t, x, step, rough):
             found.append(WrongValues(run, rows[begin:end], off))
     return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
+
+
+def clipped(runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
+    """The stretches at a limit of a column (n_r,) of each run, NaN where missing, with all other
+    samples that are equal to it."""
+    whole = np.concatenate(runs)
+    begins, found = np.cumsum([0, *map(len, runs)]), []
+    if not np.isfinite(whole).any():
+        return ()
+    least = max(_Options.entered * (resolution or 0.0), 1e-9 * float(np.nanstd(whole)))
+    for limit in (float(np.nanmin(whole)), float(np.nanmax(whole))):
+        flats = [_flats(x, limit) for x in runs]
+        abrupt = 0
+        for x, own in zip(runs, flats, strict=True):
+            for begin, end in own:
+                sides = np.abs(x[[begin - 1, min(end, len(x) - 1)]] - limit)
+                abrupt += begin > 0 and end - begin >= _Options.flat and bool((sides > least).any())
+        for run, own in enumerate(flats if abrupt > 1 else []):
+            rows = (np.arange(begin, end) + begins[run] for begin, end in own)
+            found += [WrongValues(run, one, None, limit) for one in rows]
+    return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
+
+
+def _flats(x: np.ndarray, limit: float) -> list[tuple[int, int]]:
+    """(begin, end) of stretches of samples (n,) that are equal to the limit."""
+    at = np.concatenate([[False], x == limit, [False]])
+    begins, ends = np.flatnonzero(at[1:] & ~at[:-1]), np.flatnonzero(~at[1:] & at[:-1])
+    return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
 def wrong_at_jumps(times: Runs, runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
