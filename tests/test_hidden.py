@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace as Some
 from typing import Any
 
@@ -22,6 +24,9 @@ from gfnn_jax.models.lagrangians.hidden import with_hidden, with_number
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.starts import misfit
 from gfnn_jax.signals.oscillations import Oscillations, oscillations
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+from any_record import three_carts
 
 STEP = 0.025
 
@@ -210,15 +215,7 @@ def test_modes_whose_frequencies_depend_on_the_swings_are_found():
     """Three carts on cubic springs, one mode much smaller than the others: by linear modes its
     frequency became that of another, and no law followed."""
     rng = np.random.default_rng([*b"two: three carts", 304])
-    m, rubs = np.append(1.0, rng.uniform(0.7, 2.0, 2)), rng.uniform(0.005, 0.05, 3)
-    k, cubic, own = rng.uniform(2, 10, 2), rng.uniform(1, 6, 2), rng.uniform(2.5, 10, 3)
-
-    def rates(_, s):
-        apart = np.diff(s[:3])
-        pull = np.pad(k * apart + cubic * apart**3, 1)
-        return [*s[3:], *((np.diff(pull) - own * s[:3] - rubs * s[3:]) / m)]
-
-    start, t = [1.0, *rng.uniform(-0.8, 0.8, 2), 0.0, 0.0, 0.0], 0.02 * np.arange(1_800)
+    (rates, start), t = three_carts(rng), 0.02 * np.arange(1_800)
     x = solve_ivp(rates, (0, t[-1]), start, t_eval=t, rtol=1e-10, atol=1e-12).y[0]
     x += 1e-3 * x.std() * rng.normal(size=len(t))
     recording = with_hidden(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[]), 2)
