@@ -1,5 +1,7 @@
 """Every block of code in docs/ runs, page by page from the top; every link leads somewhere."""
 
+import ast
+import importlib
 import re
 import shlex
 import sys
@@ -47,6 +49,16 @@ def test_code_runs(page, tmp_path, monkeypatch, as_a_user):
                 assert cli.main(shlex.split(line)[1:]) == 0
             else:
                 assert line.startswith(INSTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_pages_import_is_there(page):
+    """Of most pages the code runs in the slow tests alone."""
+    code = [ast.parse(text) for language, text in blocks(page) if language == "python"]
+    for found in (node for tree in code for node in ast.walk(tree)):
+        if isinstance(found, ast.ImportFrom) and (found.module or "").startswith("gfnn_jax"):
+            module = importlib.import_module(str(found.module))
+            assert not [name.name for name in found.names if not hasattr(module, name.name)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
