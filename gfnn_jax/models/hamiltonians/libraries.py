@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.residuals import misfit
 from gfnn_jax.errors import FitError
@@ -51,6 +52,8 @@ def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums | Constrained]:
     if problem.of_modes:
         most, of_data = options.most_modes, (data.dim, *angles_and_others(data))
         boxes = options.boxes if own is None else options.given_boxes
+        if own is None and has_another_period(data):
+            boxes = boxes[:2]
         families = (modes(*of_data, *box) for box in boxes)
     else:
         features, reversor = (None, None) if scene is None else (scene.features, scene.reversor)
@@ -64,6 +67,33 @@ def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums | Constrained]:
         if library.num_parameters > min(problem.most_terms, most):
             return
         yield library if own is None else constrained(problem, library)
+
+
+def has_another_period(data: Dataset) -> bool:
+    """Return whether something named as an angle has not the period 2π, as an angle in degrees: it
+    runs over turns, and moves are alike of states that are near each other as numbers, but not of
+    those that are near each other as angles."""
+    rows = data.training[: OPTIONS.turning]
+    z = np.asarray(data.pairs.z0)[rows]
+    angles = [i for i in angles_and_others(data)[0] if np.ptp(z[:, i]) > 2 * TWO_PI]
+    if not (angles and data.coordinates.plain):
+        return False
+    x, turns = z / data.scale, z[:, angles]
+    x[:, angles] = turns / turns.std(axis=0)  # their scale is that of one turn
+    turned = np.hstack([np.delete(x, angles, axis=1), np.cos(turns), np.sin(turns)])
+    moves = np.asarray(data.pairs.z1)[rows] - z
+    as_numbers, as_angles = (_differ(states, moves) for states in (x, turned))
+    return as_angles > OPTIONS.unlike and as_numbers < OPTIONS.alike * as_angles
+
+
+def _differ(x: np.ndarray, moves: np.ndarray) -> float:
+    """The mean square by which moves (N, n) differ between states x (N, k) and their nearest
+    neighbours, over that of any two, at most over the columns."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+    moves = moves[:, np.ptp(moves, axis=0) > 0]
+    near = cKDTree(x).query(x, k=2)[1][:, 1]
+    return float(np.max(np.mean((moves[near] - moves) ** 2, axis=0) / (2 * moves.var(axis=0))))
 
 
 def _beside(own: Terms, families: Iterator[Terms]) -> Iterator[Terms]:

@@ -42,8 +42,10 @@ class LawOptions:
     terms; poor_in_kind: of a structure or of modes, whose libraries differ in kind. small: terms
     of the libraries that are tried before laws of physics, 0.3 s of two bodies; exact: of the
     spread, what a polynomial errs by that is no approximation. on_branch: of the spread, an error
-    below which is that of the right branch of the turns, which turning pairs tell. truncation: a
-    flow's own error, as a part of the tolerance. generators: degrees of those that look for misfit,
+    below which is that of the right branch of the turns, which turning pairs tell. unlike: of the
+    mean square by which two moves differ, that of nearest neighbours which tell nothing; alike: of
+    it, that of those which do. truncation: a flow's own error, as a part of the tolerance.
+    generators: degrees of those that look for misfit,
     beside the one that is so far ``beyond`` the law's own: an even H lacks no odd terms;
     sampled_rows: per term, where what is left over is looked at, fewest_sampled: pairs at least, of
     many sites numbers; white_pairs: whose residuals say whether a law leaves anything but noise.
@@ -89,6 +91,8 @@ class LawOptions:
     exact: float = 1e-13
     on_branch: float = 0.05
     turning: int = 2_000
+    unlike: float = 0.5
+    alike: float = 0.1
     truncation: float = 0.1
     generators: tuple[int, ...] = (2, 3, 4, 5, 6)
     beyond: int = 2
