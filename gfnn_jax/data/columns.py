@@ -12,6 +12,7 @@ import numpy as np
 from scipy.integrate import cumulative_simpson
 from scipy.linalg import eigh
 
+from gfnn_jax.arrays import products
 from gfnn_jax.data.roles import (
     OF_CALENDAR,
     ROLES,
@@ -526,7 +527,7 @@ def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> Firs
         return FirstOrder(0.0, 0)
     every = np.concatenate(runs)
     size = np.sqrt(np.mean(every**2, axis=0)) + 1e-300
-    tables = [_quadratic(x / size) for x in runs]
+    tables = [products(x / size, 2) for x in runs]
     pairs = zip(times, tables, strict=True)
     sums = [cumulative_simpson(p, x=t, axis=0, initial=0) for t, p in pairs]
     moves = [
@@ -534,12 +535,6 @@ def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> Firs
     ]
     shares = [_explained(*moved, every) for moved in moves]
     return FirstOrder(max(shares), _constants(runs, tables))
-
-
-def _quadratic(x: np.ndarray) -> np.ndarray:
-    """1, x and products of two (n, m)."""
-    products = [a * b for a, b in itertools.combinations_with_replacement(x.T, 2)]
-    return np.stack([np.ones(len(x)), *x.T, *products], axis=1)
 
 
 def _explained(moved: list[np.ndarray], sums: list[np.ndarray], lag: int, every) -> float:

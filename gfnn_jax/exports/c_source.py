@@ -20,12 +20,10 @@ from gfnn_jax.exports.graph import LawGraph, graph_of
 from gfnn_jax.exports.symbols import Tape, literal, table
 from gfnn_jax.exports.taylor import c_of_flow
 from gfnn_jax.families.expressions import coordinate_names
-from gfnn_jax.flows.damped import DampedFlow
-from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import Domain
 from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.piece import FLOWS
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.solve.linear import COFACTORS_UP_TO
 
@@ -58,7 +56,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
             "and formulas: use --to stablehlo"
         )
     inner = dataclasses.replace(map_, coordinates=CARTESIAN)  # what pieces move
-    laws = [isinstance(piece, (Flow, LieFlow, DampedFlow)) for piece in map_.pieces]
+    laws = [isinstance(piece, FLOWS) for piece in map_.pieces]
     alone = [dataclasses.replace(inner, pieces=(piece,)) for piece in map_.pieces]
     graphs = [graph_of(own) if law else None for own, law in zip(alone, laws, strict=True)]
     sticks = any(graph is not None and graph.sticks for graph in graphs)

@@ -21,10 +21,8 @@ from gfnn_jax.exports.graph import graph_of
 from gfnn_jax.exports.javascript import javascript
 from gfnn_jax.exports.jax_source import jax_source
 from gfnn_jax.exports.robots import mjcf, urdf
-from gfnn_jax.flows.damped import DampedFlow
-from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.maps import saved
+from gfnn_jax.maps.piece import FLOWS
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import require_x64
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
@@ -96,7 +94,7 @@ def export(
         return out
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
-    of_law = isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
+    of_law = isinstance(map_.pieces[0], FLOWS)
     if to in _PRINTERS and map_.bracket is not None and (to not in ("c", "c-taylor") or not of_law):
         raise InputError(
             f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no "

@@ -33,11 +33,9 @@ from gfnn_jax.flows.rates import MOST_SUBSTEPS, substeps_for
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried
 from gfnn_jax.solve.levenberg_marquardt import descended as descended_by
 
-_DAMPING = Factors(first=1e-7, grown_by=10.0, shrunk_by=1e-2, least=5e-8, trials=9)
 ROUNDOFF = 2e-16  # of the coordinates' sizes: the residual's floor
 
 
-@dataclasses.dataclass(frozen=True)
 class Descent:
     """Options of a descent, tuned on Hénon–Heiles at dt 0.5 to 3 and on three bodies.
 
@@ -46,16 +44,13 @@ class Descent:
     the floor of rounding or truncation.
     """
 
-    damping: Factors = _DAMPING
+    damping = Factors(first=1e-7, grown_by=10.0, shrunk_by=1e-2, least=5e-8, trials=9)
     gained: float = 1e-2
     promised: float = 0.1
 
 
-DESCENT = Descent()
-
-
 def descended(
-    linearised: Callable[[np.ndarray], Triangle], c, most: int, options: Descent = DESCENT
+    linearised: Callable[[np.ndarray], Triangle], c, most: int
 ) -> tuple[np.ndarray, Triangle, int]:
     """Gauss–Newton steps from c until nothing is gained, at most so many: (coefficients, their
     triangle, steps taken). ``linearised(c)``: the problem at c, of rows wherever they are."""
@@ -63,8 +58,8 @@ def descended(
     floor = ROUNDOFF * np.sqrt(here.rows)
     if not floor < here.norm < np.inf:
         return c, here, 0
-    start = _AtCoefficients(c, here, linearised, floor, options)
-    found = descended_by(start, options.damping, most)
+    start = _AtCoefficients(c, here, linearised, floor)
+    found = descended_by(start, Descent.damping, most)
     return found.problem.c, found.problem.triangle, found.steps
 
 
@@ -76,7 +71,6 @@ class _AtCoefficients:
     triangle: Triangle
     linearised: Callable[[np.ndarray], Triangle]
     floor: float
-    options: Descent
 
     @cached_property
     def _spectrum(self) -> Spectrum:
@@ -87,14 +81,14 @@ class _AtCoefficients:
         c, norm = self.c - step(self._spectrum, damping), self.triangle.norm
         there = self.linearised(c)
         promised = norm - self._spectrum.residual_norm
-        hopeless = promised < self.options.promised * norm and there.norm < 2 * norm
+        hopeless = promised < Descent.promised * norm and there.norm < 2 * norm
         return Tried((c, there), norm - there.norm, damping, promised, hopeless)
 
     def moved(self, there, damping: float) -> tuple[_AtCoefficients, bool]:
         """The problem at the coefficients of a step; settled where it gained little."""
         c, triangle = there
         gained = 1 - triangle.norm / self.triangle.norm
-        settled = gained < self.options.gained or triangle.norm <= self.floor
+        settled = gained < Descent.gained or triangle.norm <= self.floor
         return dataclasses.replace(self, c=c, triangle=triangle), settled
 
 
@@ -513,6 +507,6 @@ def _one_step(
     spectrum = here.spectrum()
     tried, foretold = c - step(spectrum, 0.0), spectrum.residual_norm
     norm = float(np.linalg.norm(problem.residuals(family, tried, steps, rows)))
-    if here.norm <= norm < 2 * here.norm and foretold > (1 - DESCENT.promised) * here.norm:
+    if here.norm <= norm < 2 * here.norm and foretold > (1 - Descent.promised) * here.norm:
         return c  # the descent ends here too: the residual is rounding, or truncation
     return tried if abs(norm - foretold) <= OPTIONS.foretold_left_out * foretold else None

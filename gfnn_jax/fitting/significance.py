@@ -95,12 +95,11 @@ def terms_above_noise(
 
 
 def terms_with_constants(
-    triangle: Triangle, p: np.ndarray, threshold: float, inside: Sequence[Sequence[int]]
+    triangle: Triangle, p: np.ndarray, inside: Sequence[Sequence[int]]
 ) -> list[int]:
-    """The terms that are left when those below ``threshold`` standard errors go, as
-    `significant`, each with the constants inside it: ``inside`` has their places among the
-    numbers p (n,), the coefficients first, of each term."""
-    limit, every = threshold * _noise(triangle, len(p), None), np.arange(len(inside))
+    """The terms that are left when noise goes, as `significant`, each with the constants inside it:
+    ``inside`` has their places among the numbers p (n,), the coefficients first, of each term."""
+    limit, every = ABOVE_NOISE * _noise(triangle, len(p), None), np.arange(len(inside))
     return _eliminated(triangle.rebased(p), every, p, limit, inside)[0].tolist()
 
 
@@ -111,15 +110,14 @@ def _noise(triangle: Triangle, count: int, rms: float | None) -> float:
 
 
 def matched(
-    columns: np.ndarray, target: np.ndarray, null: float = NULL
+    columns: np.ndarray, target: np.ndarray
 ) -> Iterator[tuple[int, np.floating, np.floating]]:
     """Iterate over the columns (n, m) that explain the target (n,) one after another, whichever
-    explains the most: its place, how much of what is left it explains, and how much is left. null:
-    of a column's size, below which those before explain it."""
+    explains the most: its place, how much of what is left it explains, and how much is left."""
     size = np.linalg.norm(columns, axis=0)
     for _ in size:
         rest = np.linalg.norm(columns, axis=0)
-        known = rest > null * size
+        known = rest > NULL * size
         gain = np.where(known, np.abs(target @ columns) / np.where(known, rest, 1.0), 0.0)
         best = int(np.argmax(gain))
         yield best, gain[best], np.linalg.norm(target)

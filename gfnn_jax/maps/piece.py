@@ -21,6 +21,8 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.phase_space import apply_j, area, split
 from gfnn_jax.solve.status import OK, Info
 
+FLOWS = Flow, LieFlow, DampedFlow  # of a law: what serves any dt
+
 
 @runtime_checkable
 class Piece(Protocol):
@@ -71,9 +73,7 @@ def with_params(piece: Any, params: Any) -> Any:
 
 def serves_any_dt(piece: Any) -> bool:
     """Return whether a piece can be stepped over any dt."""
-    return isinstance(piece, (Flow, LieFlow, DampedFlow)) or (
-        isinstance(piece, Generated) and piece.serves_any_dt
-    )
+    return isinstance(piece, FLOWS) or (isinstance(piece, Generated) and piece.serves_any_dt)
 
 
 @pytree()

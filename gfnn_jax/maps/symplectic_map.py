@@ -27,9 +27,6 @@ from gfnn_jax.arrays import pytree
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.displacements import OfDisplacement
-from gfnn_jax.flows.damped import DampedFlow
-from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.maps import energy, programs
 from gfnn_jax.maps.domain import Domain, Ranges
@@ -45,7 +42,7 @@ from gfnn_jax.maps.lanes import (
 )
 from gfnn_jax.maps.modified_hamiltonian import ModifiedHamiltonian
 from gfnn_jax.maps.parameters import Parameters, as_args
-from gfnn_jax.maps.piece import PieceWithAction, serves_any_dt
+from gfnn_jax.maps.piece import FLOWS, PieceWithAction, serves_any_dt
 from gfnn_jax.maps.posterior import Bands, Posterior, bands
 from gfnn_jax.maps.samples import sampled
 from gfnn_jax.maps.sensors import Sensors
@@ -285,7 +282,7 @@ class SymplecticMap:
         It is the learned one where the map is the flow of a Hamiltonian. For any other map it is
         the modified Hamiltonian, whose error ``modified_hamiltonian`` gives.
         """
-        if len(self.pieces) != 1 or not isinstance(self.pieces[0], (Flow, LieFlow, DampedFlow)):
+        if len(self.pieces) != 1 or not isinstance(self.pieces[0], FLOWS):
             return self.modified_hamiltonian(z, args).value
         z = self._states(z)
         return programs.hamiltonian(self, z, self._args(args, z, t0))

@@ -198,15 +198,13 @@ class FieldFit(NamedTuple):
     """A field that was fitted to pairs.
 
     c: (J,). residual: (N, n) what it leaves of the images. relative: its RMS ÷ the spread. root:
-    (J, J), rootᵀ root the covariance of c. iterations: that it took. field: the family, with
-    constants of its own as they were fitted.
+    (J, J), rootᵀ root the covariance of c. field: the family, with constants of its own as fitted.
     """
 
     c: np.ndarray
     residual: np.ndarray
     relative: float
     root: np.ndarray
-    iterations: int
     field: Any
 
 
@@ -264,9 +262,9 @@ def fit_field(
         here = path_of(field, at, z0, z1, dt, spread)
     if here.relative == np.inf:
         raise FitError("no field of the library has a flow over dt: take pairs of a shorter dt")
-    iterations = 0
-    while here.relative > Options.roundoff and iterations < Options.most_iterations:
-        iterations += 1
+    for _ in range(Options.most_iterations):
+        if not here.relative > Options.roundoff:
+            break
         stepped, gains = _step(field, at, here, h, spread)
         before = here.relative
         for share in Options.shares if gains else Options.shares[:1]:
@@ -280,7 +278,7 @@ def fit_field(
     free = max(1.0, here.residual.size - field.num)
     root = _least(_columns(field, here.nodes, here.weights, h), here.residual, spread)[1]
     sigma = np.sqrt(np.sum((here.residual / spread) ** 2) / free)
-    return FieldFit(at, here.residual, here.relative, max(sigma, 1e-16) * root, iterations, field)
+    return FieldFit(at, here.residual, here.relative, max(sigma, 1e-16) * root, field)
 
 
 def _step(
@@ -338,9 +336,9 @@ def _least(columns, target, spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return solved, one, left.reshape(target.shape) * spread
 
 
-def undetermined(field: FreeField, z: np.ndarray, floor: float) -> np.ndarray:
-    """Combinations (m, K) of the library that vanish at all states z (N, n), to ``floor`` or to
-    roundoff: relations that the runs have in common, as one value of an invariant."""
-    values, cutoff = field.library.term_values(z), max(Options.undetermined, floor)
-    spectrum = Spectrum.of(values, values[:, 0], 0.0, cutoff)
+def undetermined(field: FreeField, z: np.ndarray) -> np.ndarray:
+    """Combinations (m, K) of the library that vanish at all states z (N, n), to roundoff: relations
+    that the runs have in common, as one value of an invariant."""
+    values = field.library.term_values(z)
+    spectrum = Spectrum.of(values, values[:, 0], 0.0, Options.undetermined)
     return spectrum.vt[~spectrum.known] / spectrum.column

@@ -328,10 +328,10 @@ def _free_field(train, held, names, terms, on_progress, least: int = 1):
         if library.num_parameters * Options.rows_per_term > len(train.z0):
             continue
         field, missing = FreeField(library), ()
-        relations = undetermined(field, train.z0, 0.0)
+        relations = undetermined(field, train.z0)
         if len(relations):
             field = FreeField(library.take(range(1, library.num_parameters)))
-            missing = undetermined(field, train.z0, 0.0)
+            missing = undetermined(field, train.z0)
         if len(missing):
             if best is not None and best[2] <= Options.partly:
                 break
@@ -416,7 +416,7 @@ def _of_populations(train: Data, held: Data, names, sigma, error: float) -> Pois
     for _, own, sigma in sorted(tried, key=lambda one: one[0]):
         if not own.field.library.gradient(own.c, z).any(axis=0).all():
             continue  # one of the populations would never change
-        fit = FieldFit(own.c, np.zeros(0), np.nan, own.root, 0, own.field)
+        fit = FieldFit(own.c, np.zeros(0), np.nan, own.root, own.field)
         fits = own.field, fit, error_on(own.field, own.c, held)
         law = PoissonLaw(*fits, bracket.name, (), own.sigma, relative=sigma is relative)
         left = law.noise_of(train.z0)

@@ -28,7 +28,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.evidence import EVIDENCE, Rival
-from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
+from gfnn_jax.fitting.significance import terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
 from gfnn_jax.flows.uniform import Uniform, momenta
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Term
@@ -372,7 +372,7 @@ def _significant(
         if found is None:
             return None
         formula, triangle = formula.at(found.p), triangle_of(found)
-        kept = terms_with_constants(triangle, found.p, ABOVE_NOISE, formula.numbers)
+        kept = terms_with_constants(triangle, found.p, formula.numbers)
         if len(kept) == count:
             break
         if not kept:
