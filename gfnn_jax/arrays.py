@@ -78,6 +78,12 @@ def matmul(a: Any, b: Any) -> Any:
     return a @ b if xp is np else xp.matmul(a, b, precision="highest")
 
 
+def stretches_of(mask: np.ndarray) -> list[tuple[int, int]]:
+    """[a, b) of each run of True in a mask (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
 def products(x: np.ndarray, degree: int) -> np.ndarray:
     """Products (N, m) of the columns of x (N, k), of degrees 0 to ``degree`` in turn."""
     found: dict[tuple[int, ...], np.ndarray] = {(): np.ones(len(x))}

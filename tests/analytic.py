@@ -104,6 +104,17 @@ def standard_map(z, k):
     return np.stack([z[:, 0] + p, p], axis=1)
 
 
+def leapfrog(z, dt, steps=1):
+    """A map that is exactly symplectic, of states (N, 2) of a pendulum: half a kick, a drift, half
+    a kick, and this so many times."""
+    (q, p), h = np.asarray(z).T, dt / steps
+    for _ in range(steps):
+        p = p - h / 2 * np.sin(q)
+        q = q + h * p
+        p = p - h / 2 * np.sin(q)
+    return np.stack([q, p], axis=1)
+
+
 def kepler(a, e, mean, turn=0.0):
     """States (..., 4) of ellipses about the centre, by bisection of Kepler's equation for the mean
     anomalies; their periapses turned by ``turn``."""
@@ -120,15 +131,20 @@ def kepler(a, e, mean, turn=0.0):
     return np.stack([q.real, q.imag, p.real, p.imag], axis=-1)
 
 
-def henon_heiles_pairs(num, seed=0, radius=0.4, dt=0.5):
-    """Pairs of states that are uniform in a box."""
+def henon_heiles(gammas=(0.0, 0.0)):
+    """The field of Hénon and Heiles, with friction."""
 
     def field(_, z):
         q1, q2, p1, p2 = z
-        return [p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2]
+        return [p1, p2, -q1 - 2 * q1 * q2 - gammas[0] * p1, -q2 - q1**2 + q2**2 - gammas[1] * p2]
 
+    return field
+
+
+def henon_heiles_pairs(num, seed=0, radius=0.4, dt=0.5):
+    """Pairs of states that are uniform in a box."""
     z0 = np.random.default_rng(seed).uniform(-radius, radius, (num, 4))
-    return Pairs(z0, moved(field, z0, dt, rtol=2.3e-14, atol=1e-16), dt)
+    return Pairs(z0, moved(henon_heiles(), z0, dt, rtol=2.3e-14, atol=1e-16), dt)
 
 
 def moved(field, z0, dt, rtol=1e-13, atol=1e-14):

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from analytic import moved
+from analytic import moved, rotated
 from other_python import ended, started
 
 import gfnn_jax as gfnn
@@ -75,9 +75,7 @@ def test_a_tree_merges_neighbours(count, in_threads):
 def image(z):
     """A kick and a turn: the flow of an oscillator of frequency 1 after a kick, no flow of few
     terms itself."""
-    q, p = z.T
-    p = p - 0.1 * q**2
-    return np.stack([np.cos(DT) * q + np.sin(DT) * p, np.cos(DT) * p - np.sin(DT) * q], axis=1)
+    return rotated(z - [0.0, 0.1] * z[:, :1] ** 2, DT)
 
 
 def flow(z):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import disc, rms
+from analytic import disc, leapfrog, rms
 
 import gfnn_jax as gfnn
 from gfnn_jax.candidates.assemble import Assembled
@@ -20,15 +20,8 @@ from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
 from gfnn_jax.scenes.systems import angular_momentum
 
 
-def pendulum(z, num_steps=50, dt=0.4):
-    """A map that is exactly symplectic: small leapfrog steps of a pendulum. NumPy, z (N, 2)."""
-    q, p = np.array(z).T
-    h = dt / num_steps
-    for _ in range(num_steps):
-        p = p - h / 2 * np.sin(q)
-        q = q + h * p
-        p = p - h / 2 * np.sin(q)
-    return np.stack([q, p], axis=1)
+def pendulum(z, dt=0.4):
+    return leapfrog(z, dt, 50)
 
 
 def pendulum_pairs(num=400, seed=0):

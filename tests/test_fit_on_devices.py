@@ -6,6 +6,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from analytic import rotated
 from other_python import run_python
 
 import gfnn_jax as gfnn
@@ -65,9 +66,7 @@ DT = 0.4
 def kicked(number):
     """Pairs of a kick and a turn."""
     z = np.random.default_rng(0).uniform(-1, 1, (number, 2))
-    q, p = z[:, 0], z[:, 1] - 0.1 * np.sin(z[:, 0])
-    z1 = np.stack([np.cos(DT) * q + np.sin(DT) * p, np.cos(DT) * p - np.sin(DT) * q], axis=1)
-    return gfnn.Pairs(z, z1, DT)
+    return gfnn.Pairs(z, rotated(z - [0.0, 0.1] * np.sin(z[:, :1]), DT), DT)
 
 
 def quartic(number):

@@ -3,7 +3,7 @@ quadratic or dry."""
 
 import numpy as np
 import pytest
-from analytic import block_on_a_spring, mechanics, moved
+from analytic import block_on_a_spring, henon_heiles, mechanics, moved
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.friction import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
@@ -27,14 +27,6 @@ def test_texts_of_friction_are_what_it_loses(direction):
 
 def states(count=200, seed=0, dim=2):
     return np.random.default_rng(seed).uniform(-0.4, 0.4, (count, 2 * dim))
-
-
-def henon_heiles(gammas):
-    def field(_, z):
-        q1, q2, p1, p2 = z
-        return [p1, p2, -q1 - 2 * q1 * q2 - gammas[0] * p1, -q2 - q1**2 + q2**2 - gammas[1] * p2]
-
-    return field
 
 
 def law_of(fit):

@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from analytic import generated, pendulum
+from analytic import generated, leapfrog, pendulum
 
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
@@ -42,21 +42,13 @@ def test_of_an_affine_map_is_its_solution_either_way(chart):
     np.testing.assert_allclose(backward(z1), unknowns(behind, z1, z0), atol=1e-13)
 
 
-def kicked(z):
-    """Step of a pendulum: half a kick, a drift, half a kick."""
-    q, p = z.T
-    p = p - 0.5 * DT * np.sin(q)
-    q = q + DT * p
-    return np.stack([q, p - 0.5 * DT * np.sin(q)], axis=1)
-
-
 @pytest.fixture(scope="module")
 def rising():
-    return fit_predictors(MIDPOINT, STATES, kicked(STATES), DT)
+    return fit_predictors(MIDPOINT, STATES, leapfrog(STATES, DT), DT)
 
 
 def test_the_degree_rises_until_the_model_is_close(rising):
-    target = unknowns(MIDPOINT, STATES, kicked(STATES))
+    target = unknowns(MIDPOINT, STATES, leapfrog(STATES, DT))
     errors = [np.abs(f.predictor.forward(STATES) - target).max() for f in rising]
     assert (np.diff(errors) < 0).all()
     assert errors[-1] < 1e-7
@@ -109,9 +101,9 @@ def test_a_dear_model_is_taken_where_it_spares_updates():
 
 def test_noise_and_few_pairs_end_the_rise():
     rng = np.random.default_rng(1)
-    noisy = kicked(STATES) + 1e-2 * rng.standard_normal(STATES.shape)
+    noisy = leapfrog(STATES, DT) + 1e-2 * rng.standard_normal(STATES.shape)
     assert len(fit_predictors(TYPE2, STATES, noisy, DT)) <= 3
-    few = fit_predictors(TYPE2, STATES[:12], kicked(STATES[:12]), DT)
+    few = fit_predictors(TYPE2, STATES[:12], leapfrog(STATES[:12], DT), DT)
     assert few[-1].predictor.forward.family.num_parameters <= 4
 
 
@@ -120,7 +112,7 @@ def test_a_coordinate_at_rest_has_no_part_in_it():
     rest = np.zeros((600, 1))
     z0, z1 = (
         np.concatenate([z[:, :1], rest, z[:, 1:], rest + 0.1], axis=1)
-        for z in (STATES, kicked(STATES))
+        for z in (STATES, leapfrog(STATES, DT))
     )
     model = fit_predictors(MIDPOINT, z0, z1, DT)[-1].predictor.forward
     np.testing.assert_allclose(model(z0), unknowns(MIDPOINT, z0, z1), rtol=0, atol=1e-5)
@@ -128,7 +120,7 @@ def test_a_coordinate_at_rest_has_no_part_in_it():
 
 def test_angles_go_round_and_the_rest_stays_small_far_away():
     z0 = STATES * [np.pi, 1.0]
-    model = fit_predictors(TYPE2, z0, kicked(z0), DT, partial(box_inputs, angles=(0,)))[
+    model = fit_predictors(TYPE2, z0, leapfrog(z0, DT), DT, partial(box_inputs, angles=(0,)))[
         -1
     ].predictor.forward
     turned = model(np.array([0.3 - 2 * np.pi, 0.2]))

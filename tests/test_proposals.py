@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from analytic import motion
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -14,10 +15,7 @@ T = 0.03 * np.arange(300)
 
 def moved(rate, start, t=T):
     """Positions of ẍ = rate(x, v) from (x, v)."""
-    found = solve_ivp(
-        lambda s, z: [z[1], rate(*z)], (t[0], t[-1]), start, "DOP853", t, rtol=1e-10, atol=1e-10
-    )
-    return found.y[0]
+    return motion(rate, start, t, method="DOP853", atol=1e-10)[0]
 
 
 def pendulum(rng, amplitude, t=T):

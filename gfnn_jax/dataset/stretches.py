@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.arrays import stretches_of
 from gfnn_jax.data.recording import Recording, args_of, channels_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.signals.local_polynomials import Smooth, choose_half, smooth
@@ -500,8 +501,8 @@ def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
         window = max(9, round(scales.period / scales.of(stretch)[0]))
         at_rest = _still(stretch, scales.sigma, window) | _creeps(stretch, scales.sigma, window)
         at_rest = _shrunk(at_rest, round(Options.kept * window))
-        resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
-        for a, b in _runs(~at_rest):
+        resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in stretches_of(at_rest))
+        for a, b in stretches_of(~at_rest):
             if b - a >= min(window, len(at_rest)):
                 kept.append(stretch.part(a, b))
             else:
@@ -542,12 +543,6 @@ def _shrunk(mask: np.ndarray, by: int) -> np.ndarray:
     """The mask without the first and the last ``by`` samples of each of its runs, but for those at
     its ends."""
     found = np.zeros_like(mask)
-    for a, b in _runs(mask):
+    for a, b in stretches_of(mask):
         found[a + by * (a > 0) : max(b - by * (b < len(mask)), a)] = True
     return found
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """[a, b) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

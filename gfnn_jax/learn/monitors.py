@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.arrays import stretches_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.generating.generated import Generated
@@ -148,8 +149,7 @@ def _of_latent_readings(
     ends = [inner, *pieces[:own]], [*pieces[own + 1 :], outer]
     turns = []  # without a missing value
     for y in (np.concatenate(_ends(q, 1 - k), axis=1) for q in runs):
-        parts = np.split(y, np.flatnonzero(np.diff(np.isfinite(y).all(axis=1))) + 1)
-        turns += [part for part in parts if np.isfinite(part).all() and len(part)]
+        turns += [y[a:b] for a, b in stretches_of(np.isfinite(y).all(axis=1))]
     found = latent_readings(pieces[own], ends, turns)
     if found is None:
         return None

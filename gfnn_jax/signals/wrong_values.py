@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
+from gfnn_jax.arrays import stretches_of
 from gfnn_jax.signals.steps import Runs
 
 TURN = 2 * np.pi
@@ -116,7 +117,7 @@ def clipped(runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
         return ()
     least = max(_Options.entered * (resolution or 0.0), 1e-9 * float(np.nanstd(whole)))
     for limit in (float(np.nanmin(whole)), float(np.nanmax(whole))):
-        flats = [_flats(x, limit) for x in runs]
+        flats = [stretches_of(x == limit) for x in runs]
         abrupt = 0
         for x, own in zip(runs, flats, strict=True):
             for begin, end in own:
@@ -126,13 +127,6 @@ def clipped(runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
             rows = (np.arange(begin, end) + begins[run] for begin, end in own)
             found += [WrongValues(run, one, None, limit) for one in rows]
     return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
-
-
-def _flats(x: np.ndarray, limit: float) -> list[tuple[int, int]]:
-    """(begin, end) of stretches of samples (n,) that are equal to the limit."""
-    at = np.concatenate([[False], x == limit, [False]])
-    begins, ends = np.flatnonzero(at[1:] & ~at[:-1]), np.flatnonzero(~at[1:] & at[:-1])
-    return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
 def wrong_at_jumps(times: Runs, runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
@@ -295,13 +289,11 @@ def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> lis
         return []
     times = np.diff(t)
     ways = np.abs(np.diff(x)) * np.minimum(np.median(times) / times, 1.0)  # a gap makes a long way
-    same = np.concatenate([[False], ways == 0, [False]])
-    begins = np.flatnonzero(same[1:] & ~same[:-1])
-    ends = np.flatnonzero(~same[1:] & same[:-1])
     slow = max(_Options.resolutions * resolution, rough)
-    many = (ends - begins + 1 >= _Options.fewest) & (ends < len(ways))
     found = []
-    for begin, end in zip(begins[many], ends[many], strict=True):
+    for begin, end in stretches_of(ways == 0):
+        if end - begin + 1 < _Options.fewest or end == len(ways):
+            continue
         before = ways[max(begin - _Options.around, 0) : begin]
         behind = ways[end + 1 :][: _Options.around]
         around = [part for part in (before, behind) if len(part) == _Options.around]
@@ -309,5 +301,5 @@ def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> lis
         fastest = max((part.max() for part in around), default=0.0)
         way = max(_Options.fewest * slow, _Options.jump * fastest)
         if moves and ways[end] > way:
-            found.append((int(begin) + 1, int(end) + 1))
+            found.append((begin + 1, end + 1))
     return found
