@@ -78,7 +78,7 @@ def matmul(a: Any, b: Any) -> Any:
     return a @ b if xp is np else xp.matmul(a, b, precision="highest")
 
 
-def stretches_of(mask: np.ndarray) -> list[tuple[int, int]]:
+def stretches_of(mask: Any) -> list[tuple[int, int]]:
     """[a, b) of each run of True in a mask (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
