@@ -6,7 +6,7 @@ import math
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.integrate import cumulative_simpson
@@ -226,8 +226,8 @@ def _by_data(
         notes.append(f"by their units {', '.join(lengths)} are positions{driving}")
     if unclear or (inputs and not (pairs or lengths)):
         own = [np.stack([values[n] for n in moving], axis=1) for _, values in runs.values()]
-        explained = first_order(times, own).explained if len(moving) > 1 else 0.0
-        raise _unclear(source, columns, moving, unclear or inputs, explained)
+        share = explained(times, own) if len(moving) > 1 else 0.0
+        raise _unclear(source, columns, moving, unclear or inputs, share)
     return {
         "positions": (*(x for x, _ in pairs), *lengths),
         "velocities": tuple(v for _, v in pairs),
@@ -295,12 +295,12 @@ def _unclear(
     columns: Mapping[str, np.ndarray],
     moving: Sequence[str],
     shown: Sequence[str],
-    explained: float,
+    share: float,
 ) -> Undecided:
-    """Options for columns that nothing tells apart. explained: share of their rates that functions
-    of them explain."""
+    """Options for columns that nothing tells apart. share: of their rates, that functions of them
+    explain."""
     positions = {"positions": tuple(moving)}
-    if explained > _Options.first_order:
+    if share > _Options.first_order:
         states = {"structure": "poisson", "states": tuple(moving)}
         return Undecided(
             f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
@@ -499,42 +499,46 @@ def crossings_in(observe: Mapping[str, Any]) -> tuple[str, ...]:
 TOLD = 0.9  # share of the changes that quadratic functions explain of no positions
 
 
-class FirstOrder(NamedTuple):
-    """explained: share of the variance of the changes that quadratic functions explain, of the
-    column with the least. constants: number of quadratic functions, or of linear ones with
-    logarithms, that are constant in each run and differ between runs."""
-
-    explained: float
-    constants: int
-
-    @property
-    def told(self) -> bool:
-        """True of columns that are no positions: their rates, and an energy, depend on them."""
-        return self.explained > TOLD and self.constants > 0
-
-
-def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> FirstOrder:
-    """Columns (n_r, k) of runs, at times (n_r,), as the motion of states ẋ = f(x).
+def explained(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> float:
+    """Share of the variance of the changes of columns (n_r, k) of runs, at times (n_r,), that
+    quadratic functions explain, of the column with the least: the motion of states ẋ = f(x).
 
     x(t + h) − x(t) = ∫ f dt is fitted with f quadratic, which no noise of a derivative spoils.
     """
-    kept = [np.isfinite(x).all(axis=1) for x in runs]
-    times = [t[own] for t, own in zip(times, kept, strict=True)]
-    runs = [x[own] for x, own in zip(runs, kept, strict=True)]
-    runs = [x for x in runs if len(x) > 2 * _Options.parts]
-    times = [t for t in times if len(t) > 2 * _Options.parts]
-    if not runs:
-        return FirstOrder(0.0, 0)
-    every = np.concatenate(runs)
+    kept = [(t[own], x[own]) for t, x in zip(times, runs, strict=True) if len(own := _whole(x))]
+    if not kept:
+        return 0.0
+    every = np.concatenate([x for _, x in kept])
     size = np.sqrt(np.mean(every**2, axis=0)) + 1e-300
-    tables = [products(x / size, 2) for x in runs]
-    pairs = zip(times, tables, strict=True)
-    sums = [cumulative_simpson(p, x=t, axis=0, initial=0) for t, p in pairs]
-    moves = [
-        ([x[k:] - x[:-k] for x in runs], [s[k:] - s[:-k] for s in sums], k) for k in _Options.lags
+    # One function at a time: those of a long record side by side would fill the memory.
+    sums = [
+        [cumulative_simpson(f, x=t, initial=0) for f in products(x / size, 2).T] for t, x in kept
     ]
-    shares = [_explained(*moved, every) for moved in moves]
-    return FirstOrder(max(shares), _constants(runs, tables))
+    shares = []
+    for k in _Options.lags:
+        thin = 1 + sum(max(len(x) - k, 0) for _, x in kept) // _Options.most
+        moved = [(x[k:] - x[:-k])[::thin] for _, x in kept]
+        rows = [np.stack([(f[k:] - f[:-k])[::thin] for f in own], axis=1) for own in sums]
+        shares.append(_explained(moved, rows, -(-k // thin), every))
+    return max(shares)
+
+
+def constants(runs: Sequence[np.ndarray]) -> int:
+    """Number of quadratic functions of columns (n_r, k) of runs, or of linear ones with logarithms,
+    that are constant in each run and differ between runs."""
+    runs = [x[own] for x in runs if len(own := _whole(x))]
+    if len(runs) < _Options.runs:
+        return 0
+    found = [_constant_within([products(x, 2)[:, 1:] for x in runs])]
+    if all((x > 0).all() for x in runs):
+        found.append(_constant_within([np.concatenate([x, np.log(x)], axis=1) for x in runs]))
+    return max(found)
+
+
+def _whole(x: np.ndarray) -> np.ndarray:
+    """The rows of a run (n, k) in which nothing is missing; none of a run that is too short."""
+    own = np.flatnonzero(np.isfinite(x).all(axis=1))
+    return own if len(own) > 2 * _Options.parts else own[:0]
 
 
 def _explained(moved: list[np.ndarray], sums: list[np.ndarray], lag: int, every) -> float:
@@ -546,9 +550,8 @@ def _explained(moved: list[np.ndarray], sums: list[np.ndarray], lag: int, every)
     variance = np.var(target, axis=0)
     if np.any(variance > _Options.quarter * np.var(every, axis=0)):
         return 0.0
-    thin, left, judged = 1 + len(target) // _Options.most, np.zeros(target.shape[1]), 0
+    left, judged = np.zeros(target.shape[1]), 0
     for own, others in _parts([len(x) for x in moved], lag):
-        own, others = own[::thin], others[::thin]
         if len(others) < _Options.samples * rows.shape[1]:
             return 0.0
         c = np.linalg.lstsq(rows[others], target[others], rcond=_Options.told_apart)[0]
@@ -572,16 +575,6 @@ def _parts(lengths: list[int], lag: int) -> Iterator[tuple[np.ndarray, np.ndarra
             others = (place <= edges[:, 0] - lag) | (place >= edges[:, 1] - 1 + lag)
         if own.any():
             yield np.flatnonzero(own), np.flatnonzero(others)
-
-
-def _constants(runs: list[np.ndarray], tables: list[np.ndarray]) -> int:
-    """Number of functions that are constant in each run and differ between runs."""
-    if len(runs) < _Options.runs:
-        return 0
-    found = [_constant_within([table[:, 1:] for table in tables])]
-    if all((x > 0).all() for x in runs):
-        found.append(_constant_within([np.concatenate([x, np.log(x)], axis=1) for x in runs]))
-    return max(found)
 
 
 def _constant_within(tables: list[np.ndarray]) -> int:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import optimize
 
-from gfnn_jax.data.columns import TOLD, first_order
+from gfnn_jax.data.columns import TOLD, constants, explained
 from gfnn_jax.data.faults import Fault, faults
 from gfnn_jax.data.roles import is_rate_of_turning
 from gfnn_jax.data.traits import Accelerations, Traits, accelerations, turning_points
@@ -67,12 +67,14 @@ def _states(traits: Traits) -> Iterator[Fault]:
     if not 2 <= len(names) <= _Options.most_states or others or recording.explained:
         return
     runs = [np.stack(x, axis=1) for x in zip(*map(traits.by_run, names), strict=True)]
-    found, shown = first_order(traits.times, runs), ", ".join(names)
-    if not found.told and not (found.explained > TOLD and all(map(is_rate_of_turning, names))):
+    kept, shown = constants(runs), ", ".join(names)
+    if not kept and not all(map(is_rate_of_turning, names)):
+        return
+    if explained(traits.times, runs) <= TOLD:
         return
     populations = all((x > 0).all() for x in runs)
     what = "of populations" if populations else "of the rates of a body that turns"
-    keeps = f", and each run keeps {found.constants} of these" * (found.constants > 0)
+    keeps = f", and each run keeps {kept} of these" * (kept > 0)
     yield Fault(
         "first order",
         f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}: these are "
