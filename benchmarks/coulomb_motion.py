@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 _AT_REST = 1e-9  # of a joint's speed, in its units
 _ROUNDING = 1e-12  # of a force that a joint holds for ever
 _EVENTS = 100_000  # of one motion
+_FIRST = 1e-6  # step behind an event, of what is left: a joint let go may stick again within one
 
 
 class Body(NamedTuple):
@@ -80,7 +81,8 @@ class Body(NamedTuple):
             return left
 
         events = [event(joint) for joint in range(len(modes))]
-        return solve_ivp(rate, (t, last), x, events=events, dense_output=True, **options)
+        first = {"first_step": _FIRST * (last - t)} | options
+        return solve_ivp(rate, (t, last), x, events=events, dense_output=True, **first)
 
     def _changed(self, x: np.ndarray, modes: np.ndarray, ended: np.ndarray, u) -> np.ndarray:
         """The modes behind an event of the joints that have ``ended`` theirs: one that stuck slides

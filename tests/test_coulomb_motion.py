@@ -8,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
+import coulomb_motion
 from coulomb_motion import Body
 
 OPTIONS = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
@@ -63,3 +64,19 @@ def test_a_solver_that_fails_is_told():
     runaway = Body(lambda q: np.eye(1), lambda q, v, u: v**2, np.zeros((0, 1)), np.zeros(0))
     with pytest.raises(RuntimeError, match="no solution beyond t = 1"):
         runaway.follow(np.array([0.0, 1.0]), np.array([0.0, 2.0]), **OPTIONS)
+
+
+def test_a_block_that_slips_for_less_than_a_step(monkeypatch):
+    """A push of 1 + a² − (t − 1)² on a block with friction 1, which slips from t = 1 − a on, until
+    its speed is back at 0 at t = 1 + 2 a: SciPy's first step would pass over all of it."""
+    monkeypatch.setattr(coulomb_motion, "_EVENTS", 20)
+    a = 0.005
+
+    def push(q, v, u):
+        return np.array([0.0, 1 + a**2 - (q[0] - 1) ** 2])
+
+    both = Body(lambda q: np.eye(2), push, np.array([[0.0, 1.0]]), np.array([1.0]))
+    w = np.array([1e-6, 2 * a, 3 * a, 0.5])  # time since it was let go
+    x = both.follow(np.array([1 - a + w[0], 0.0, 1.0, 0.0]), w - w[0], **OPTIONS)
+    w = np.minimum(w, 3 * a)
+    np.testing.assert_allclose(x[:, 1], a * w**3 / 3 - w**4 / 12, atol=1e-13)
