@@ -95,15 +95,18 @@ def wrong_values(times: Runs, runs: Runs, resolution: float | None) -> tuple[Wro
     begins = np.cumsum([0, *map(len, times)])
     known = [np.flatnonzero(np.isfinite(x)) for x in runs]
     series = [(t[k], x[k], b + k) for t, x, k, b in zip(times, runs, known, begins, strict=False)]
-    rough, step = _roughness([_misses(t, x) for t, x, _ in series]), resolution or 0.0
-    found = []
+    misses, step, found = [_misses(t, x) for t, x, _ in series], resolution or 0.0, []
+    rough = _roughness(misses)
     for run, (t, x, rows) in enumerate(series):
         moving = np.ones(len(x), bool)
         for begin, end in _stuck(t, x, step, rough):
             moving[begin:end] = False
             found.append(WrongValues(run, rows[begin:end], None))
-        t, x, rows = t[moving], x[moving], rows[moving]
-        for begin, end, off in _outliers(t, x, step, rough):
+        miss = misses[run]
+        if not moving.all():
+            t, x, rows = t[moving], x[moving], rows[moving]
+            miss = _misses(t, x)
+        for begin, end, off in _outliers(t, x, miss, step, rough):
             found.append(WrongValues(run, rows[begin:end], off))
     return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
 
@@ -186,13 +189,12 @@ def _roughness(runs: Runs) -> float:
 
 
 def _outliers(
-    t: np.ndarray, x: np.ndarray, resolution: float, rough: float
+    t: np.ndarray, x: np.ndarray, miss: np.ndarray, resolution: float, rough: float
 ) -> list[tuple[int, int, float]]:
     """(begin, end, how far off at most) of stretches of samples of a run (n,).
 
-    t, x: without missing values. resolution: the smallest step between values, 0 if it is unknown.
-    rough: of the column (`_roughness`)."""
-    miss = _misses(t, x)
+    t, x: without missing values. miss: the `_misses` (n,). resolution: the smallest step between
+    values, 0 if it is unknown. rough: of the column (`_roughness`)."""
     if len(x) < 2 * _Options.side + 1 or not miss.max() > _Options.rough * rough:
         return []
     usual = np.maximum(_nearby(miss), max(resolution, 1e-12 * np.ptp(x)))
