@@ -342,6 +342,7 @@ def pushed(hold, delay=0.0, uniform=0.0):
         ((1, 0), friction.LINEAR, 0.0, 0.1),
         ((1, -1), friction.QUADRATIC, 0.0, 0.2),
         ((0, 1), friction.DRY, 0.3, 0.05),
+        ((1, -1), friction.PLACED, 0.1, 0.3),
     ]
     law = mechanics(rows, losses, uniform, [[1.0], [0.5]])
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))

@@ -8,7 +8,7 @@ import pytest
 import scipy.integrate
 
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, PLACED, Friction
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
@@ -35,8 +35,8 @@ H = Terms(
 C = np.array([0.5, 0.5, 0.5, 0.5, 1.0, -1 / 3, 0.4])
 GAMMA = 0.3
 Z = np.random.default_rng(0).uniform(-0.2, 0.2, (12, 4))
-FRICTION = Friction.of([((1, 0), LINEAR, 0.0), ((1, -1), DRY, 0.3)], 2)
-LOSSES, GAINS = np.array([0.2, 0.1]), np.array([[1.0, 0.5], [0.0, 2.0]])
+FRICTION = Friction.of([((1, 0), LINEAR, 0.0), ((1, -1), DRY, 0.3), ((0, 1), PLACED, 0.1)], 2)
+LOSSES, GAINS = np.array([0.2, 0.1, 2.0]), np.array([[1.0, 0.5], [0.0, 2.0]])
 INPUTS = 0.1 * np.random.default_rng(1).normal(size=(12, 3, 2))  # u, u̇, ü/2 of each lane
 FORCED, PARAMS = Forced(H, FRICTION, 2, 2), np.concatenate([C, LOSSES, GAINS.ravel()])
 BOTH, BOTH_PARAMS = Uniform(FORCED), np.append(PARAMS, GAMMA)
@@ -57,7 +57,12 @@ def exact(gamma, forced):
         if forced:
             s = v[0] - v[1]
             dry = LOSSES[1] * s / np.sqrt(s**2 + 0.09)
-            push = push - [LOSSES[0] * v[0] + dry, -dry] + GAINS @ (u[0] + u[1] * t + u[2] * t**2)
+            place = LOSSES[2] * (z[1] - 0.1) ** 2 * v[1]
+            push = (
+                push
+                - [LOSSES[0] * v[0] + dry, place - dry]
+                + GAINS @ (u[0] + u[1] * t + u[2] * t**2)
+            )
         return np.concatenate([v, push])
 
     options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-15}

@@ -7,7 +7,7 @@ from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC
+from gfnn_jax.families.friction import DRY, LINEAR, PLACED, QUADRATIC, Friction
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 
@@ -25,6 +25,7 @@ def test_terms_are_read_as_they_are_written():
         "V: theta1**2*theta2*sin(2*theta2)",
         ["R: omega1**2", " abs(omega2 - omega1)**3"][0],
         "R: abs(omega2 - omega1)**3 + sqrt(omega2**2 + 0.04) + abs(omega1)",
+        "R: theta2**2*omega2**2 + (omega1 - omega2)**2*(theta1 - theta2 + 0.4)**2/2",
     )
     assert found.terms == (
         V1,
@@ -37,7 +38,12 @@ def test_terms_are_read_as_they_are_written():
         ((-1, 1), QUADRATIC, 0.0),
         ((0, 1), DRY, 0.2),
         ((1, 0), DRY, 0.0),
+        ((0, 1), PLACED, 0.0),
+        ((1, -1), PLACED, -0.4),
     )
+    texts = [text for text, _ in Friction.of(found.friction, 2).texts(SPEEDS, (), POSITIONS)]
+    assert texts[-1] == "(theta1 - theta2 + 0.4)**2*(omega2 - omega1)**2"
+    assert read(*(f"R: 2*{text}" for text in texts)).friction == found.friction
 
 
 def test_shapes_are_what_is_no_power_and_no_wave():
@@ -77,6 +83,8 @@ def test_masses_are_there_without_being_said():
         ("exp(omega1)", "'exp\\(omega1\\)' is no term of a law"),
         ("theta3**2", "the name 'theta3'"),
         ("R: omega1**5", "is no term"),
+        ("R: theta1**2*omega2**2", "is no term"),
+        ("R: theta1**2*(omega1 + 1)**2", "is no term"),
     ],
 )
 def test_what_is_no_term_is_refused(text, message):

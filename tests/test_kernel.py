@@ -16,6 +16,7 @@ from gfnn_jax.families.friction import (
     LINEAR,
     LOADED,
     ONE_SIDED,
+    PLACED,
     POWER,
     QUADRATIC,
     STRIBECK,
@@ -163,11 +164,11 @@ def test_derivatives_are_finite_differences(leaders):
     (form, p), (x, h, u) = law_of(2, True, False, shapes=True), lanes_of(2, 20)
     more = [((1, 0), POWER, 3.0), ((0, 1), POWER, 1.5), ((0, 1), ONE_SIDED, 0.0)]
     more += [((1, 1), ISOTROPIC, 2.0), ((0, 1), STRIBECK, 0.5), ((1, 0), LOADED + 1, 0.2)]
-    more += [((0, 1), LOADED, 0.0)]
+    more += [((0, 1), LOADED, 0.0), ((1, -2), PLACED, 0.3)]
     friction = Friction.of([*form.friction.rows()[:2], *more, *form.friction.rows()[-1:]], 2)
     terms = dataclasses.replace(form.terms, leaders=leaders)
     form = dataclasses.replace(form, terms=terms, friction=friction)
-    p = np.insert(p, form.basis.shape[1] + 3, [0.2, 0.3, 0.25, 0.15, 0.1, 0.2])
+    p = np.insert(p, form.basis.shape[1] + 3, [0.2, 0.3, 0.25, 0.15, 0.1, 0.2, 0.3])
     x[:, 2:] += np.where(np.abs(x[:, 2:]) < 0.1, 0.3, 0.0)  # of a side no turn
     law = form.lagrangian(p)
     ahead, behind = (form.step(p, x, s * h / 1e3, u[:, :1], 0).states for s in (1, -1))

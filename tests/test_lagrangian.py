@@ -13,6 +13,7 @@ from gfnn_jax.families.friction import (
     LINEAR,
     LOADED,
     ONE_SIDED,
+    PLACED,
     POWER,
     QUADRATIC,
     STRIBECK,
@@ -41,8 +42,8 @@ SHAPES = {
 THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6, 0.3, 0.8])
 FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
 FRICTION += [((1, 0), POWER, 1.5), ((0, -1), ONE_SIDED, 0.0), ((1, 1), ISOTROPIC, 2.0)]
-FRICTION += [((1, -1), STRIBECK, 0.4), ((1, 0), LOADED + 2, 0.2)]
-RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15, 0.25, 0.35])
+FRICTION += [((1, -1), STRIBECK, 0.4), ((1, 0), LOADED + 2, 0.2), ((-1, 1), PLACED, 0.3)]
+RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15, 0.25, 0.35, 0.45])
 GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
 
 
@@ -61,7 +62,7 @@ def plain(q, v):
     return total
 
 
-def rayleigh(v, u):
+def rayleigh(q, v, u):
     s = v[1] - v[0]
     of_all = (
         v[0] ** 2 / 2,
@@ -72,6 +73,7 @@ def rayleigh(v, u):
         (v @ v) ** 1.5 / 3,
         0.4 * (1 - jnp.exp(-jnp.abs(s) / 0.4)) - jnp.abs(s),
         jnp.abs(u[2]) * jnp.sqrt(v[0] ** 2 + 0.04),
+        (q[1] - q[0] - 0.3) ** 2 * s**2 / 2,
     )
     return sum(rho * term for rho, term in zip(RHO, of_all, strict=True))
 
@@ -107,7 +109,7 @@ def test_acceleration_solves_the_equation_of_motion():
     found = derivatives_of_the_plain_sum(q, v)
     _, by_q, momentum, _, of_q, _, masses = (np.asarray(one) for one in found)
     rate = np.einsum("nij,nj->ni", of_q, v) + np.einsum("nij,nj->ni", masses, a)
-    friction = np.asarray(jax.jit(jax.vmap(jax.grad(rayleigh)))(v, u)) + 0.03 * momentum
+    friction = np.asarray(jax.jit(jax.vmap(jax.grad(rayleigh, 1)))(q, v, u)) + 0.03 * momentum
     np.testing.assert_allclose(rate, by_q - friction + u @ GAINS.T, rtol=1e-11, atol=1e-11)
     terms = law().terms.residuals(q, v, a)
     rest = np.einsum("npd,p->nd", terms, THETA) - law().forces(q, v, u)
@@ -128,10 +130,14 @@ def test_energy_changes_by_the_power_of_the_forces():
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_friction_is_the_gradient_of_its_potential(xp):
     """And its stiffness the Hessian, at rest too, where |v|³ has one."""
-    _, v = states()
+    q, v = states()
     model = law()
     u = np.random.default_rng(1).normal(size=(5, 3))
-    found, expected = model.losses_by_v(xp.asarray(v), u), jax.vmap(jax.hessian(rayleigh))(v, u)
+    found = model.losses_by_v(q, xp.asarray(v), u)
+    expected = jax.vmap(jax.hessian(rayleigh, 1))(q, v, u)
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
+    found = model.friction.by_place(xp.asarray(q), xp.asarray(v), RHO)
+    expected = jax.vmap(jax.jacfwd(jax.grad(rayleigh, 1)))(q, v, u)
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
     drag = Friction.of([((1, 1), ISOTROPIC, a) for a in (1.0, 2.0, 3.0)], 2)
     rest, one = xp.zeros((1, 2)), xp.ones(3)

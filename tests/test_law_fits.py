@@ -453,6 +453,25 @@ def test_stribecks_friction_is_found_where_most_of_the_motion_is_fast():
     assert slow == pytest.approx(0.1, rel=0.05)  # of dry friction what is left at speed
 
 
+@pytest.mark.parametrize("centre", [0.0, 0.5])
+def test_friction_that_grows_with_the_square_of_the_place_is_found(centre):
+    """ẍ = −x − c (x − x₀)² ẋ about a zero of the column. |v|³ and v⁴ imitated it, identified."""
+    t, c, zero = 0.15 * np.arange(400), 0.06, 2.0
+    (x,) = motion(lambda q, v: -q - c * (q - centre) ** 2 * v, [1.3, 0.0], t)
+    seen = x + zero + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": seen}, positions="x"))
+    assert fit.verdict == "identified"
+    (loss,) = fit.friction.terms
+    (place,) = re.findall(r"\(x - (\S+)\)\*\*2\*v\*\*2", loss.term)
+    assert float(place) == pytest.approx(centre + zero, abs=0.01)
+    assert abs(loss.coefficient - c / 2) < 4 * loss.std < 0.002
+    known = gfnn.fit(
+        gfnn.Recording({"t": t, "x": seen}, positions="x"), terms=["V: x**2 + x", f"R: {loss.term}"]
+    )
+    assert known.friction.terms[0].coefficient == pytest.approx(c / 2, abs=3e-4)
+    assert known.friction.terms[0].std < loss.std  # beside which the centre is not known
+
+
 @pytest.mark.slow
 def test_stribecks_friction_is_found_with_the_speed_over_which_it_fades():
     """A body on a spring that is driven by a force which is recorded, and sticks."""

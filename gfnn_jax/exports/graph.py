@@ -74,16 +74,17 @@ class LawGraph:
         return sum(map(len, self.series))
 
 
-def _pulls(own: friction.Friction, v: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """∂r_k/∂v (F, d) at v (d,) on symbols: the signs of speeds are given, 0 of friction that needs
-    none. |v| of isotropic friction is that of speeds above 1e-8: it has no series at 0."""
+def _pulls(own: friction.Friction, q: Any, v: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """∂r_k/∂v (F, d) at q, v (d,) on symbols: the signs of speeds are given, 0 of friction that
+    needs none. |v| of isotropic friction is that of speeds above 1e-8: it has no series at 0."""
     pulls = []
     for c, kind, width, sign in zip(own.directions, own.kinds, own.widths, signs, strict=True):
         if kind == friction.ISOTROPIC:
             size = (c @ (v * v) + 1e-16).sqrt()
             pulls.append(c * v * size ** (float(width) - 1))
         else:
-            pulls.append(c * friction.TABLE[kind].signed(c @ v, sign, width))
+            place = (c @ q - width) * (c @ q - width) if kind == friction.PLACED else 1.0
+            pulls.append(c * friction.TABLE[kind].signed(c @ v, sign, width) * place)
     return np.array(pulls, dtype=object)
 
 
@@ -189,7 +190,7 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     v = gradient[dim:]
     forces = -gradient[:dim] - z[0, dim:] * law.uniform
     if own.count:
-        forces = forces - losses @ _pulls(own, v, signs)
+        forces = forces - losses @ _pulls(own, z[0, :dim], v, signs)
     if law.num_inputs:
         forces = forces + gains @ args[0, -law.num_inputs :]
     speeds = [own.directions[k] @ v for k in signed]

@@ -7,7 +7,9 @@ one-sided, r = ½ max(s, 0)², which beside linear friction makes it depend on t
 Stribeck's is what dry friction loses at speeds above w, r = −|s| + w (1 − e^(−|s|/w)) (Tustin
 1947). The drag of a body in a plane or in space is isotropic: r = |v|^(a + 1)/(a + 1), |v| over the
 coordinates of c. Friction that depends on a load is dry friction times the size of an input, the
-normal force that is recorded, r = |u_j| |s| (Coulomb 1785). Everything is batch first, in closed
+normal force that is recorded, r = |u_j| |s| (Coulomb 1785). Friction that depends on the place
+grows with the square of its distance from C, r = ½ (c·q − C)² s²: of a feedback by the amplitude,
+as van der Pol's, or of a magnet that leaves the gap of a coil. Everything is batch first, in closed
 form, and runs in NumPy or JAX.
 """
 
@@ -23,8 +25,11 @@ from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.text import added, barred, combination, shown
 
 # Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone. LOADED + j is the kind of
-# which input j is the load.
-LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED, ISOTROPIC, STRIBECK, LOADED = range(9)
+# which input j is the load; PLACED, by the place, is the last of TABLE.
+LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED, ISOTROPIC, STRIBECK, LOADED, PLACED = (
+    *range(9),
+    -1,
+)
 _FACTORS = {1 / 2: "½ ", 1 / 3: "⅓ ", 1 / 4: "¼ ", 1 / 8: "⅛ ", 1.0: ""}
 
 
@@ -130,6 +135,13 @@ TABLE = (
         rare=True,
     ),
     _OF_DRY._replace(name="load-dependent", rare=True),
+    Kind(
+        "place-dependent",
+        lambda speed, size, width: (_squared(speed), 1 / 2),
+        lambda xp, s, size, width: (0.5 * s * s, s, xp.ones_like(s)),
+        lambda s, sign, width: s,
+        rare=True,
+    ),
 )
 
 
@@ -147,9 +159,10 @@ def _is_none(sign: Any) -> bool:
 class Friction:
     """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), places in `TABLE`,
     from LOADED on by the input that is the load; widths (F,): ε of dry friction and w of
-    Stribeck's, in units of v, and the exponent a of POWER and ISOTROPIC.
+    Stribeck's, in units of v, C of PLACED, of q, and the exponent a of POWER and ISOTROPIC.
 
-    Methods take inputs u (..., k), or None: a load is 0 where none are given."""
+    Methods take inputs u (..., k), or None: a load is 0 where none are given; and positions q
+    (..., d), where friction may depend on the place."""
 
     directions: Any
     kinds: Any
@@ -176,14 +189,16 @@ class Friction:
         ]
 
     def texts(
-        self, speeds: Sequence[str], inputs: Sequence[str] = ()
+        self, speeds: Sequence[str], inputs: Sequence[str] = (), positions: Sequence[str] = ()
     ) -> tuple[tuple[str, float], ...]:
-        """Each term as code in the names of the velocities and of the inputs, by default u1, …, and
-        the number before it: ("v1**2", ½), ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1), ("(abs(v1) +
-        v1)**2", ⅛) of one-sided friction, ("sqrt(v1**2 + v2**2)**3", ⅓) of isotropic drag,
-        ("abs(u1)*abs(v1)", 1) of friction by a load; uniform friction, a row without a direction,
+        """Each term as code in the names of the velocities, of the inputs, by default u1, …, and of
+        the positions, by default q1, …, and the number before it: ("v1**2", ½), ("abs(v2 -
+        v1)**3", ⅓), ("abs(v2)", 1), ("(abs(v1) + v1)**2", ⅛) of one-sided friction, ("sqrt(v1**2 +
+        v2**2)**3", ⅓) of isotropic drag, ("abs(u1)*abs(v1)", 1) of friction by a load,
+        ("(q1 - 2)**2*v1**2", ½) of that by the place; uniform friction, a row without a direction,
         is γ T.
         """
+        places = positions or [f"q{i + 1}" for i in range(self.directions.shape[1])]
         listed = []
         for direction, kind, width in self.rows():
             named = [*speeds][::-1]
@@ -197,6 +212,10 @@ class Friction:
             text, number = kind_of(kind).text(speed, size, width)
             if kind >= LOADED:
                 text = f"abs({inputs[kind - LOADED] if inputs else f'u{kind - LOADED + 1}'})*{text}"
+            if kind == PLACED:
+                centre = f"{-width:+.6g}" if width else ""
+                place = combination(direction, places)
+                text = f"{_squared(f'{place} {centre[:1]} {centre[1:]}'.strip())}*{text}"
             listed.append((text, number))
         return tuple(listed)
 
@@ -224,9 +243,25 @@ class Friction:
         """The dry friction (F,) that has no width: its force jumps where its speed turns."""
         return self.dry & (self.widths == 0)
 
-    def loads(self, u: Any) -> Any:
-        """Return the factor of each term at inputs u (..., k): |u_j| (..., F) of friction by a
-        load, 1 of others; 1.0 where none has a load."""
+    @property
+    def placed(self) -> Any:
+        """The friction (F,) by the place."""
+        return self.kinds == PLACED
+
+    def factors(self, u: Any, q: Any = None) -> Any:
+        """Return the factor of each term at inputs u (..., k) and positions q (..., d): |u_j| (...,
+        F) of friction by a load, (c·q − C)² of that by the place, 1 of others; 1.0 where none has
+        either."""
+        if not self._may_be_placed(q):
+            return self._loads(u)
+        places, xp = self._places(q), namespace(q, self.kinds)
+        return self._loads(u) * xp.where(self.placed, places * places, 1.0)
+
+    def _places(self, q: Any) -> Any:
+        """c·q − C, of friction by the place, at q (..., d): (..., F)."""
+        return matmul(q, self.directions.astype(q.dtype).T) - self.widths
+
+    def _loads(self, u: Any) -> Any:
         xp, loaded = namespace(self.kinds, u), self.loaded
         if np.size(u) == 0 or (namespace(loaded) is np and not np.any(loaded)):
             return 1.0
@@ -254,7 +289,8 @@ class Friction:
         s = self.speeds(v)
         size = xp.abs(s)
         kinds, widths = as_row(xp.minimum(self.kinds, LOADED), s), as_row(self.widths, s)
-        some = range(len(TABLE)) if xp is not np else np.unique(kinds).tolist()
+        every = (*range(LOADED + 1), PLACED)
+        some = every if xp is not np else np.unique(kinds).tolist()
         found = (0 * s,) * 3
         for kind in some:
             of_kind = TABLE[kind].tables(xp, s, size, xp.where(kinds == kind, widths, 1.0))
@@ -262,26 +298,36 @@ class Friction:
         value, slope, curvature = found
         return value, slope, curvature
 
-    def residuals(self, v: Any, u: Any = None) -> Any:
+    def residuals(self, v: Any, u: Any = None, q: Any = None) -> Any:
         """∂r_k/∂v at v (..., d): (..., F, d)."""
         plain, _, across, _ = self._parts(v)
-        plain = plain * self.loads(u)
+        plain = plain * self.factors(u, q)
         c = as_row(self.directions.astype(v.dtype), plain[..., None])
         pulls = plain[..., None] * c
         return pulls if across is None else pulls + across[..., None] * c * v[..., None, :]
 
-    def forces(self, v: Any, losses: Any, u: Any = None) -> Any:
+    def forces(self, v: Any, losses: Any, u: Any = None, q: Any = None) -> Any:
         """∂R/∂v at v (..., d), of coefficients ρ (F,) or (..., F): (..., d)."""
         plain, _, across, _ = self._parts(v)
-        plain = plain * self.loads(u)
+        plain = plain * self.factors(u, q)
         c, losses = self.directions.astype(v.dtype), as_row(losses, plain)
         along = matmul(losses * plain, c)
         return along if across is None else along + v * matmul(losses * across, c)
 
-    def stiffness(self, v: Any, losses: Any, u: Any = None) -> Any:
+    def by_place(self, q: Any, v: Any, losses: Any) -> Any:
+        """∂²R/∂v∂q at q, v (..., d), of coefficients ρ (F,) or (..., F): (..., d, d); None where no
+        friction depends on the place."""
+        if not self._may_be_placed(q):
+            return None
+        c, d, xp = self.directions.astype(v.dtype), v.shape[-1], namespace(q, self.kinds)
+        slopes = xp.where(self.placed, 2 * self._places(q) * matmul(v, c.T), 0.0)
+        outer = (c[:, :, None] * c[:, None, :]).reshape(-1, d**2)
+        return matmul(as_row(losses, slopes) * slopes, outer).reshape(*v.shape, d)
+
+    def stiffness(self, v: Any, losses: Any, u: Any = None, q: Any = None) -> Any:
         """∂²R/∂v∂v at v (..., d), of coefficients ρ (F,) or (..., F): (..., d, d)."""
         xp, (_, curvature, across, bent) = namespace(v), self._parts(v)
-        curvature = curvature * self.loads(u)
+        curvature = curvature * self.factors(u, q)
         c, losses, d = self.directions.astype(v.dtype), as_row(losses, curvature), v.shape[-1]
         outer = (c[:, :, None] * c[:, None, :]).reshape(-1, d**2)
         along = matmul(losses * curvature, outer).reshape(*v.shape, d)
@@ -292,9 +338,9 @@ class Friction:
         turned = matmul(losses * bent, outer).reshape(along.shape)
         return along + turned * v[..., :, None] * v[..., None, :]
 
-    def power(self, v: Any, u: Any = None) -> Any:
+    def power(self, v: Any, u: Any = None, q: Any = None) -> Any:
         """v·∂r_k/∂v at v (..., d): (..., F)."""
-        return self.tables(v)[1] * self.speeds(v) * self.loads(u)
+        return self.tables(v)[1] * self.speeds(v) * self.factors(u, q)
 
     def _parts(self, v: Any) -> tuple[Any, Any, Any, Any]:
         """dr/ds and d²r/ds² (..., F) of speeds c·v; and of isotropic rows (dr/ds) ÷ |v|, by which
@@ -307,6 +353,13 @@ class Friction:
         across = xp.where(own, xp.where(s > 0, slope / size, curvature), 0.0)
         bent = xp.where(own, (curvature - across) / size**2, 0.0)
         return xp.where(own, 0.0, slope), xp.where(own, 0.0, curvature), across, bent
+
+    def _may_be_placed(self, q: Any) -> bool:
+        """Return whether positions are given and a row may be friction by the place: traced by JAX,
+        kinds are not known."""
+        if q is None:
+            return False
+        return namespace(self.kinds) is not np or bool(np.any(self.placed))
 
     def _may_be_isotropic(self, xp: Any) -> bool:
         """Return whether a row may be isotropic: traced by JAX, kinds are not known."""

@@ -383,12 +383,12 @@ class Lagrangian:
 
     def forces(self, q: Any, v: Any, u: Any = None) -> Any:
         """−∂R/∂v − γ ∂L/∂v + G u (..., d); u is (..., inputs), or None for none."""
-        push = -self.friction.forces(v, self.losses, u) - self.uniform * self.momentum(q, v)
+        push = -self.friction.forces(v, self.losses, u, q) - self.uniform * self.momentum(q, v)
         return push if u is None else push + pushed(self.gains, u)
 
-    def losses_by_v(self, v: Any, u: Any = None) -> Any:
+    def losses_by_v(self, q: Any, v: Any, u: Any = None) -> Any:
         """∂²R/∂v∂v (..., d, d)."""
-        return self.friction.stiffness(v, self.losses, u)
+        return self.friction.stiffness(v, self.losses, u, q)
 
     def balance(self, q: Any, v: Any, u: Any = None) -> tuple[Any, Any]:
         """M (..., d, d) and the force (..., d) of M a = ∂L/∂q − (∂²L/∂v∂q) v − ∂R/∂v − γ ∂L/∂v +
@@ -409,7 +409,7 @@ class Lagrangian:
         """Energy per unit of time: lost to each friction (..., F + 1), the last one uniform
         friction, and supplied by each input (..., inputs)."""
         xp = namespace(v)
-        lost = self.friction.power(v, u)
+        lost = self.friction.power(v, u, q)
         lost = lost * as_row(self.losses, lost)
         even = self.uniform * (self.momentum(q, v) * v).sum(-1)
         lost = xp.concatenate([lost, even[..., None]], axis=-1)

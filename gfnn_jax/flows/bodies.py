@@ -105,6 +105,6 @@ class BodiesLaw:
         held = self.bodies.forces(self.parameters, q, v, 0 * v) + self.offsets
         return self.masses(q), -held - lost
 
-    def losses_by_v(self, v: Any, u: Any = None) -> Any:
+    def losses_by_v(self, q: Any, v: Any, u: Any = None) -> Any:
         """∂²R/∂v∂v (..., k, k)."""
         return self.friction.stiffness(v, self.losses, u)

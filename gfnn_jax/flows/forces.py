@@ -100,7 +100,8 @@ class Forced(WithForces):
     def term_gradients(self, w, args=None):
         """The field of every term of H and R (..., 2d, m), those of R as if v were p: to start
         from. NumPy."""
-        frictions = np.swapaxes(self.friction.residuals(split(w)[1], self._inputs(args)), -1, -2)
+        q, p = split(w)
+        frictions = np.swapaxes(self.friction.residuals(p, self._inputs(args), q), -1, -2)
         frictions = np.concatenate([frictions, np.zeros_like(frictions)], axis=-2)
         return np.concatenate(
             [self.family.term_gradients(w, self._inner(args)), frictions], axis=-1
@@ -134,28 +135,33 @@ class Forced(WithForces):
         """(∂H/∂q + ∂R/∂v − G u, ∂H/∂p), shape (..., 2d)."""
         own, losses, gains = self.parts(params)
         gradient = self.family.gradient(own, w, self._inner(args))
-        return self._field(gradient, losses, gains, args)
+        return self._field(gradient, losses, gains, split(w)[0], args)
 
     def gradient_and_hessian(self, params, w, args=None):
         """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         own, losses, gains = self.parts(params)
         gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
-        field = self._field(gradient, losses, gains, args)
-        by_v = self.friction.stiffness(split(gradient)[1], losses, self._inputs(args))
-        return field, self._beside(hessian, by_v)
+        (q, _), (_, v) = split(w), split(gradient)
+        field = self._field(gradient, losses, gains, q, args)
+        by_v = self.friction.stiffness(v, losses, self._inputs(args), q)
+        derivative, by_q = self._beside(hessian, by_v), self.friction.by_place(q, v, losses)
+        if by_q is None:
+            return field, derivative
+        of_q = np.eye(self.dim, 2 * self.dim)
+        return field, derivative + matmul(of_q.T, matmul(by_q, of_q))
 
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂params of the field (..., 2d, m); of a family ``along`` of other terms of H those of
         its coefficients alone. NumPy."""
         own, losses, _ = self.parts(params)
         inner, dim = self._inner(args), self.dim
-        v = split(self.family.gradient(own, w, inner))[1]
+        q, v = split(w)[0], split(self.family.gradient(own, w, inner))[1]
         columns = parameter_gradients(self.family, own, w, inner, along)
         u = self._inputs(args)
-        columns = self._beside(columns, self.friction.stiffness(v, losses, u))
+        columns = self._beside(columns, self.friction.stiffness(v, losses, u, q))
         if along is not None:
             return columns
-        frictions = np.swapaxes(self.friction.residuals(v, u), -1, -2)
+        frictions = np.swapaxes(self.friction.residuals(v, u, q), -1, -2)
         pushes = -(np.eye(dim)[:, :, None] * u[..., None, None, :]).reshape(*u.shape[:-1], dim, -1)
         pushes = np.broadcast_to(pushes, (*w.shape[:-1], dim, dim * self.num_inputs))
         more = np.concatenate([frictions, pushes], axis=-1)
@@ -168,7 +174,7 @@ class Forced(WithForces):
         own, losses, gains = self.parts(params)
         v = split(self.family.gradient(own, w, self._inner(args)))[1]
         u = self._inputs(args)
-        lost = self.friction.power(v, u)
+        lost = self.friction.power(v, u, split(w)[0])
         lost = as_row(losses, lost) * lost
         supplied = pushed(namespace(gains).swapaxes(gains, -1, -2), v) * u
         if not self._driven:
@@ -200,9 +206,9 @@ class Forced(WithForces):
         start = args.shape[-1] - (self.degree + 1) * self.num_inputs
         return args[..., start : start + self.num_inputs]
 
-    def _field(self, gradient, losses, gains, args):
+    def _field(self, gradient, losses, gains, q, args):
         along_q, along_p = split(gradient)
-        along_q = along_q + self.friction.forces(along_p, losses, self._inputs(args))
+        along_q = along_q + self.friction.forces(along_p, losses, self._inputs(args), q)
         if self.num_inputs:
             along_q = along_q - pushed(gains, self._inputs(args))
         return namespace(gradient).concatenate([along_q, along_p], axis=-1)

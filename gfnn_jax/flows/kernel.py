@@ -45,7 +45,7 @@ from gfnn_jax.flows.translated import compiled, function
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
 # Kinds of friction; COULOMB: dry, without a width.
-VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED, DRAG, FADING = range(9)
+VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED, DRAG, FADING, PLACED = range(10)
 
 # Rows of n: sizes (below); of each term its degree in v, the coordinates of its factors v, its wave
 # m·q, the number of coordinates in its factor f(q), whether it has powers, and its level; the level
@@ -376,7 +376,7 @@ def _other(n, f, k, i):
 @function
 def _friction(n, f, u, order):
     """The forces of friction but for uniform friction, with inputs in the row u, and their
-    derivatives in v."""
+    derivatives in v, and in q where they depend on the place."""
     d, c, raw = n[SIZES, DIM], n[SIZES, DIRECTIONS], n[SIZES, RAW]
     for k in range(n[SIZES, FRICTIONS]):
         kind, loss = n[KINDS, k], f[LOSSES, k]
@@ -387,7 +387,7 @@ def _friction(n, f, u, order):
         for i in range(d):
             speed += f[c + i, k] * f[X, d + i] * _other(n, f, k, i)
         pull = speed
-        if kind == VISCOUS:
+        if kind in (VISCOUS, PLACED):
             stiffness = 1.0
         elif kind == CUBIC:
             pull, stiffness = speed * abs(speed), 2.0 * abs(speed)
@@ -411,6 +411,13 @@ def _friction(n, f, u, order):
                 stiffness = (f[WIDTHS, k] - 1.0) * pull / speed
         else:
             pull = f[MODES, k]
+        place = 0.0
+        if kind == PLACED:
+            place = -f[WIDTHS, k]
+            for i in range(d):
+                place += f[c + i, k] * f[X, i]
+            load = place * place
+            place *= 2.0 * speed
         pull, stiffness = pull * load, stiffness * load
         f[PULL, k] = pull
         f[HELD, k], f[LIMIT, k] = loss * pull, loss * load
@@ -421,6 +428,8 @@ def _friction(n, f, u, order):
                 for m in range(d if order > 0 else 0):
                     by = f[c + m, k] * _other(n, f, k, m)
                     f[raw + i, d + m] += loss * stiffness * along * by
+                    if kind == PLACED:
+                        f[raw + i, m] += loss * place * along * by
                     if i == m:
                         f[raw + i, d + m] += loss * turned * f[c + i, k]
 

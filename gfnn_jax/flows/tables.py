@@ -14,6 +14,7 @@ from gfnn_jax.families.friction import (
     LINEAR,
     LOADED,
     ONE_SIDED,
+    PLACED,
     POWER,
     QUADRATIC,
     STRIBECK,
@@ -36,6 +37,7 @@ _KINDS = {
     ISOTROPIC: row.DRAG,
     STRIBECK: row.FADING,
     LOADED: row.SMOOTHED,
+    PLACED: row.PLACED,
 }
 _BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
 _TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack

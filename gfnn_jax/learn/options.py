@@ -323,7 +323,8 @@ OPTIONS: dict[str, About] = {
         "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
         "(drag, ∝ v |v|), isotropic (drag of a plane or of space), cubic, dry (Coulomb), stribeck "
         "(beside dry: what it loses at speed), load-dependent (dry, ∝ the size of an input), "
-        "one-sided (viscous, of one direction), uniform (R = γT); several joined by +",
+        "place-dependent (viscous, ∝ x²), one-sided (viscous, of one direction), uniform (R = γT); "
+        "several joined by +",
         "KIND",
     ),
     "input_hold": About(

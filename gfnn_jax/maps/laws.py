@@ -125,7 +125,7 @@ def stiffness(law: Lagrangian | BodiesLaw, q: np.ndarray, u: np.ndarray | None =
     inputs u (n, k), 1/time; 0 without dry friction."""
     if not np.any(law.friction.dry):
         return 0.0
-    rates = np.linalg.solve(law.masses(q), law.losses_by_v(0 * q, u))
+    rates = np.linalg.solve(law.masses(q), law.losses_by_v(q, 0 * q, u))
     return float(np.abs(np.linalg.eigvals(rates)).max())
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_noise, with_states
-from gfnn_jax.families.friction import STRIBECK
+from gfnn_jax.families.friction import PLACED, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS
 from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised, without_each
@@ -21,7 +21,7 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.motion import Form, Step
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, kind_named
 from gfnn_jax.models.lagrangians.structure import Key, Structure, is_constant
 from gfnn_jax.models.lagrangians.text import Names, word_of
 from gfnn_jax.models.lagrangians.windows import Windows
@@ -534,10 +534,10 @@ class LawFit:
     @functools.cached_property
     def linearised(self) -> Linearised:
         """The problem close to p, in which correlated residuals count once; the speeds over which
-        friction of kinds that were tried fades are at their best for each p, as they were
-        fitted."""
-        tried = "stribeck" in self.problem.options.frictions
-        fading = [row for row in self.structure.friction if tried and row[1] == STRIBECK]
+        friction of kinds that were tried fades, and its centres, are at their best for each p, as
+        they were fitted."""
+        tried = {STRIBECK, PLACED} & {*map(kind_named, self.problem.options.frictions)}
+        fading = [row for row in self.structure.friction if row[1] in tried and row[2]]
         if not (fading and self.follows):
             return Linearised.of_arcs(self.fitted, self.correlation)
         ends = [("loss", (*r[:2], r[2] * by)) for r in fading for by in (1 + _SMALL, 1 - _SMALL)]

@@ -17,9 +17,9 @@ which the best has odds of less than 20 the one with the fewest kinds is taken: 
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
 that before isotropic drag, quadratic and dry friction. Uniform friction is tried beside linear
 friction, and isotropic drag beside quadratic friction, only where both are asked for. Rare kinds,
-cubic, one-sided, Stribeck's and that by a load, come last: one of them beside the others, or in
-place of one, where that has odds of 20 against the set without it, by held-out arcs and by
-Schwarz's criterion of all.
+cubic, one-sided, Stribeck's and that by a load or by the place, come last: one of them beside the
+others, or in place of one, where that has odds of 20 against the set without it, by held-out arcs
+and by Schwarz's criterion of all.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other
 coefficients miss on the arcs that they are not from. Where there is a choice, a set is therefore
@@ -44,6 +44,8 @@ from gfnn_jax.families.friction import (
     DRY,
     ISOTROPIC,
     LINEAR,
+    LOADED,
+    PLACED,
     QUADRATIC,
     STRIBECK,
     UNIFORM,
@@ -159,7 +161,7 @@ def _in_isotropic(kinds: Sequence[int]) -> tuple[int, ...]:
 def plainness(kinds: Sequence[int]) -> tuple[float, ...]:
     """The rank of kinds among as many others: uniform friction first, and isotropic drag, which has
     one coefficient, before quadratic friction."""
-    order = {UNIFORM: -1.0, ISOTROPIC: LINEAR + 0.5}
+    order = {UNIFORM: -1.0, ISOTROPIC: LINEAR + 0.5, PLACED: LOADED}
     return tuple(sorted(order.get(kind, kind) for kind in kinds))
 
 

@@ -15,7 +15,7 @@ positions and, in V, of the inputs: the current of a magnet, V: i**2/(0.01 + y),
 moves, V: (y - s)**2.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +37,7 @@ from gfnn_jax.families.friction import (
     LINEAR,
     LOADED,
     ONE_SIDED,
+    PLACED,
     POWER,
     QUADRATIC,
     STRIBECK,
@@ -201,6 +202,8 @@ class _Reader(NamedTuple):
                 raise self.refused(text)
             (which,) = loads[0].operands[0].operands
             return with_powers((direction, LOADED + which, width), of_system)
+        if len(factors) == 2 and {*factors.values()} == {2}:
+            return with_powers(self.by_place(factors, text), of_system)
         if len(factors) != 1:
             raise self.refused(text)
         ((inside, exponent),) = factors.items()
@@ -231,6 +234,19 @@ class _Reader(NamedTuple):
         direction = tuple(found[0].get(d + i, 0) for i in range(d))
         return with_powers((direction, kind, width), of_system)
 
+    def by_place(self, squares: Iterable[Expression], text: str) -> Loss:
+        """(c, kind, C) of (c·q − C)² (c·v)², by c·q − C and c·v."""
+        d, found, constants = len(self.positions), {}, {}
+        for multiples, constant in filter(None, map(whole_multiples, squares)):
+            for k in (0, d):
+                if multiples and {*multiples} <= {*range(k, k + d)}:
+                    found[k] = tuple(multiples.get(k + i, 0) for i in range(d))
+                    constants[k] = constant
+        either = [found.get(d), tuple(-k for k in found.get(d, ()))]
+        if found.get(0) not in either or constants[d]:
+            raise self.refused(text)
+        return found[0], PLACED, -constants[0]
+
     def smoothed(self, tree: Expression, text: str) -> tuple[Expression, float]:
         """(v, ε) of v² + ε²."""
         if tree.operation == "+" and (tree.operands[1].value or 0.0) > 0:
@@ -245,8 +261,8 @@ class _Reader(NamedTuple):
             f"terms: '{text}' is no term of a law. A term of L or V is a formula of "
             f"{', '.join((*self.positions, *self.inputs))}, in L without inputs times up to two of "
             f"{', '.join(self.speeds)}; one of R is v**2, abs(v)**a, abs(v), "
-            f"(abs(v) + v)**2, exp(-abs(v)/0.1) beside abs(v), abs(u)*abs(v) of an input u, or "
-            f"sqrt(v**2 + w**2)**a, a >= 2{of}"
+            f"(abs(v) + v)**2, exp(-abs(v)/0.1) beside abs(v), abs(u)*abs(v) of an input u, "
+            f"(q - 0.1)**2*v**2, or sqrt(v**2 + w**2)**a, a >= 2{of}"
         )
 
 

@@ -20,18 +20,18 @@ from gfnn_jax.families.friction import (
     LINEAR,
     LOADED,
     ONE_SIDED,
+    PLACED,
     POWER,
     QUADRATIC,
     STRIBECK,
-    TABLE,
     UNIFORM,
     kind_of,
 )
 from gfnn_jax.families.lagrangian import INPUTS, tree_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row
 
-KINDS = tuple(range(len(TABLE)))
-FRICTIONS = tuple(kind.name for kind in TABLE)
+KINDS = (*range(LOADED), LOADED, PLACED)
+FRICTIONS = tuple(kind_of(kind).name for kind in KINDS)
 ALTERNATIVES = ({LINEAR, UNIFORM}, {QUADRATIC, ISOTROPIC})  # of which a law has one by choice
 CUBIC = 3.0  # the power of the speed that is tried
 HIGHEST = 6  # degree of potentials of lengths
@@ -359,6 +359,11 @@ def names_of(kinds: Iterable[int]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(kind_of(kind).name for kind in kinds))
 
 
+def kind_named(name: str) -> int:
+    """The kind of friction of one of `FRICTIONS`."""
+    return KINDS[FRICTIONS.index(name)]
+
+
 def losses(
     dim: int,
     kinds: tuple[int, ...],
@@ -369,11 +374,13 @@ def losses(
 ) -> list[Loss]:
     """Friction of each coordinate, and of relative speeds (``joints``; unless given of neighbours);
     uniform friction has no direction. Rare kinds are those of single coordinates, one-sided
-    friction of either side, Stribeck's of the width 1, and by the load of each of so many
-    ``inputs``. Isotropic drag, as |v|², is that of the plane or the space of the ``lengths``."""
+    friction of either side, Stribeck's of the width 1, by the place, and by the load of each of so
+    many ``inputs``. Isotropic drag, as |v|², is that of the plane or the space of the
+    ``lengths``."""
     directions = [unit(dim, i) for i in range(dim)]
     of_power = [(c, POWER, CUBIC) for c in directions if POWER in kinds]
     of_power += [(c, STRIBECK, 1.0) for c in directions if STRIBECK in kinds]
+    of_power += [(c, PLACED, 0.0) for c in directions if PLACED in kinds]
     loads = range(inputs * (LOADED in kinds))
     of_power += [(c, LOADED + j, width) for c in directions for j in loads]
     sides = [(tuple(side * i for i in c), ONE_SIDED, 0.0) for c in directions for side in (1, -1)]

@@ -28,7 +28,7 @@ from gfnn_jax.families.expressions import (
     to_text,
     with_leaves,
 )
-from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK
+from gfnn_jax.families.friction import DRY, LINEAR, PLACED, QUADRATIC, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.fitting.evidence import criterion, improved
 from gfnn_jax.maps.observation import observed
@@ -67,7 +67,8 @@ class Options:
     imitated: share of what it changes that no coefficient does, below which it is not known;
     corrections: of it; furthest: relative, of each; settled: standard errors, within which it is
     found. noise: times it, that is no more;
-    fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
+    fades: of a speed's rms, between which Stribeck's friction does; ends: quantiles of the motion,
+    between which centres of friction are; speeds: tried between these, and centres;
     as_fast: relative, within which it is found. clearly: of Schwarz's
     criterion, that a sensor gains where a law leaves more; explains: of what that law leaves, the
     share that the one beside the sensor may leave, where it is no noise, and of what the plain law
@@ -89,6 +90,7 @@ class Options:
     corrections: int = 6
     furthest: float = 0.3
     settled: float = 0.1
+    ends: tuple[float, float] = (0.05, 0.95)
     as_fast: float = 0.01
     speeds: int = 19
     noise: float = 2.0
@@ -131,14 +133,29 @@ def fades(direction: Sequence[int], problem: ArcProblem) -> list[float]:
     return [float(f"{speed * one:.2g}") for one in Options.fades]
 
 
+def _numbers(row: Loss, problem: ArcProblem) -> np.ndarray:
+    """Numbers among which that of a friction is looked for: speeds over which Stribeck's may fade,
+    or centres of that by the place."""
+    if row[1] == PLACED:
+        q = problem.states[:, : problem.dim] @ np.array(row[0], float)
+        low, high = np.quantile(q, Options.ends).tolist()
+        return np.linspace(low, high, Options.speeds)
+    slow, *_, fast = fades(row[0], problem)
+    return np.geomspace(slow, fast, Options.speeds)
+
+
 def as_it_fades(row: Loss, fit: LawFit) -> Loss:
-    """Stribeck's friction as a fit has it. Of one that has dry friction alone, with the speed over
-    which it would be seen best beside linear friction, which a slow fading would imitate: with
-    another one it may not be seen at all."""
+    """Stribeck's friction, or that by the place, as a fit has it. Of one that has dry friction
+    alone, with the speed over which it would be seen best beside linear friction, which a slow
+    fading would imitate: with another one it may not be seen at all. By the place, with the centre
+    by which it would."""
     along = {one[1]: one for one in fit.structure.friction if one[0] == row[0]}
-    if STRIBECK in along or DRY not in along:
-        return along.get(STRIBECK, row)
-    tried = [("loss", (*row[:2], speed)) for speed in fades(row[0], fit.problem)]
+    if row[1] in along or (row[1] == STRIBECK and DRY not in along):
+        return along.get(row[1], row)
+    numbers = fades(row[0], fit.problem)
+    if row[1] == PLACED:
+        numbers = [0.0, *(float(f"{one:.2g}") for one in _numbers(row, fit.problem)[::3])]
+    tried = [("loss", (*row[:2], number)) for number in numbers]
     beside = fit.structure.plus([] if LINEAR in along else [("loss", (row[0], LINEAR, 0.0))])
     larger = beside.plus(tried)
     one = fit.problem.linearised(larger, fit).added(*places(larger, beside, tried))
@@ -146,18 +163,16 @@ def as_it_fades(row: Loss, fit: LawFit) -> Loss:
 
 
 def with_fading(fit: LawFit) -> LawFit:
-    """The fit with the speeds over which its Stribeck friction fades that leave least, to three
-    digits: by the linearised problem, then by fits."""
+    """The fit with the speeds over which its Stribeck friction fades, to three digits, and the
+    centres of that by the place, that leave least: by the linearised problem, then by fits."""
     begun = fit
     for row in fit.structure.friction:
+        if row[1] == PLACED and fit.follows:
+            fit = _centred(fit, row)
         if row[1] != STRIBECK or not fit.follows:
             continue
         for _ in range(Options.corrections):
-            other = (*row[:2], float(f"{_best_speed(fit, row):.3g}"))
-            turned = tuple(other if one == row else one for one in fit.structure.friction)
-            known = {("loss", other) if k == ("loss", row) else k: c for k, c in fit.values.items()}
-            structure = dataclasses.replace(fit.structure, friction=turned)
-            found = fit.again(structure, known, rescale=False)
+            found, other = _turned(fit, row, float(f"{_best(fit, row):.3g}"))
             if not found.follows or not found.fitted.cost < fit.fitted.cost:
                 break
             change, fit, row = abs(np.log(other[2] / row[2])), found, other
@@ -166,12 +181,45 @@ def with_fading(fit: LawFit) -> LawFit:
     return fit if fit is begun else fit.again()
 
 
-def _best_speed(fit: LawFit, row: Loss) -> float:
-    """The speed over which Stribeck friction of a fit would fade where the linearised problem
-    leaves least."""
-    slow, *_, fast = fades(row[0], fit.problem)
-    speeds = np.geomspace(slow, fast, Options.speeds)
-    tried = [("loss", (*row[:2], float(speed))) for speed in speeds]
+def _centred(fit: LawFit, row: Loss) -> LawFit:
+    """The fit with the centre of a friction by the place that leaves least, to a tenth of its
+    standard error; 0 where it may be that."""
+    begun, number, error = fit, _best(fit, row), np.nan
+    apart = Options.apart * np.ptp(_numbers(row, fit.problem))
+    for _ in range(Options.corrections):
+        found, other = _turned(fit, row, number)
+        if found.follows and found.fitted.cost < fit.fitted.cost:
+            fit, row = found, other
+        elif fit is not begun:
+            break
+        size = fit.values["loss", row] / (2 * apart)
+        ends = {("loss", (*row[:2], row[2] + k * apart)): k * size for k in (1, -1)}
+        change, error = fit.along(ends, fit.structure.plus(list(ends)), least=Options.imitated)
+        if not abs(change) > Options.settled * error:
+            break
+        number = row[2] + change
+    if not error > 0:
+        return begun
+    least, (zero, _) = fit.criterion() + np.log(fit.independent), _turned(fit, row, 0.0)
+    if zero.follows and zero.criterion(fit.independent) < least:
+        return zero
+    digits = int(np.ceil(-np.log10(Options.settled * error)))
+    return _turned(fit, row, round(row[2], digits))[0]
+
+
+def _turned(fit: LawFit, row: Loss, number: float) -> tuple[LawFit, Loss]:
+    """The fit with another number in one friction, and that friction."""
+    other = (*row[:2], number)
+    turned = tuple(other if one == row else one for one in fit.structure.friction)
+    known = {("loss", other) if k == ("loss", row) else k: c for k, c in fit.values.items()}
+    structure = dataclasses.replace(fit.structure, friction=turned)
+    return fit.again(structure, known, rescale=False), other
+
+
+def _best(fit: LawFit, row: Loss) -> float:
+    """The number in a friction of a fit for which the linearised problem leaves least."""
+    numbers = _numbers(row, fit.problem)
+    tried = [("loss", (*row[:2], float(number))) for number in numbers]
     larger, others = fit.structure.plus(tried), fit.structure.without({("loss", row)})
     near = fit.problem.linearised(larger, fit)
     whole = dataclasses.replace(near, triangle=near.triangle.rebased(-near.p))
@@ -179,8 +227,10 @@ def _best_speed(fit: LawFit, row: Loss) -> float:
     best = int(np.clip(np.argmin(left), 1, len(left) - 2))
     low, least, high = left[best - 1 : best + 2]
     bend = low - 2 * least + high
-    shift = (low - high) / (2 * bend) if bend > 0 else np.sign(low - high)
-    return float(speeds[best] * (speeds[1] / speeds[0]) ** np.clip(shift, -1, 1))
+    shift = np.clip((low - high) / (2 * bend) if bend > 0 else np.sign(low - high), -1, 1)
+    if row[1] == PLACED:
+        return float(numbers[best] + shift * (numbers[1] - numbers[0]))
+    return float(numbers[best] * (numbers[1] / numbers[0]) ** shift)
 
 
 def with_viscous_as_it_fades(fit: LawFit) -> LawFit:

@@ -24,6 +24,7 @@ from gfnn_jax.families.friction import (
     ISOTROPIC,
     LINEAR,
     LOADED,
+    PLACED,
     STRIBECK,
     UNIFORM,
     kind_of,
@@ -320,7 +321,7 @@ class TermSearch:
             if self.frictions is not None and not fit.problem.parameters:
                 fit, choice = self._exchanged(fit, choice)
             fit = with_equal_masses(fit, fit.problem.options.evidence.significant)
-        if STRIBECK in choice.kinds and self.frictions is not None:
+        if {STRIBECK, PLACED} & {*choice.kinds} and self.frictions is not None:
             fit = with_fading(fit)
             choice = choice._replace(rows=fit.structure.friction)
         return SearchResult(with_delay(fit), choice)
@@ -424,7 +425,8 @@ class TermSearch:
     def _may_rub(self, fit: LawFit) -> list[Loss]:
         """Friction that the law of a fit may have; Stribeck's as it has it, and by a load where it
         has dry friction."""
-        rows = [as_it_fades(r, fit) if r[1] == STRIBECK else r for r in self.frictions or ()]
+        found = {STRIBECK, PLACED}  # with a number inside that a fit tells
+        rows = [as_it_fades(r, fit) if r[1] in found else r for r in self.frictions or ()]
         dry = np.any(fit.form.friction.dry) or not fit.problem.options.choose_friction
         rows = [row for row in rows if row[1] < LOADED or dry]
         return [row for row in rows if fit.structure.may_have(("loss", row))]
@@ -554,12 +556,14 @@ def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
     coordinates, where there is a choice, no rare kind, and of two speeds none of their
     sum."""
     dim, options = problem.dim, problem.options
-    kinds = tuple(map(libraries.FRICTIONS.index, options.frictions))
+    kinds = tuple(map(libraries.kind_named, options.frictions))
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     inputs, joints = problem.num_inputs, problem.joints
     rows = libraries.losses(dim, kinds, 0.0, problem.lengths, inputs, joints)
     rows = [(c, k, fades(c, problem)[-3]) if k == STRIBECK else (c, k, w) for c, k, w in rows]
+    turning = {*problem.angles} - {*problem.within_a_turn}
+    rows = [row for row in rows if row[1] != PLACED or not turning & {*np.flatnonzero(row[0])}]
     if not options.choose_friction and ISOTROPIC in kinds and ISOTROPIC not in kinds_of(rows):
         raise InputError(
             "isotropic friction is that of a plane or of space: expected two or three positions "

@@ -52,7 +52,9 @@ def terms_of(terms: Terms, coefficients: np.ndarray, std: np.ndarray, names: Nam
 
 def friction_of(friction: Friction, losses: np.ndarray, std: np.ndarray, names: Names) -> Formula:
     """Terms of Rayleigh's R."""
-    listed = zip(friction.texts(names.speeds, names.inputs), losses, std, strict=True)
+    listed = zip(
+        friction.texts(names.speeds, names.inputs, names.coordinates), losses, std, strict=True
+    )
     return Formula(tuple(Term(text, float(ρ * r), float(s * abs(r))) for (text, r), ρ, s in listed))
 
 

@@ -322,7 +322,7 @@ def _integrals(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
     g, dg = terms.motion(v)
     momentum = terms.acting(dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
     force = terms.acting(df * g[..., None]).swapaxes(1, 2)
-    lost = form.friction.residuals(v, windows.u).swapaxes(1, 2)
+    lost = form.friction.residuals(v, windows.u, q).swapaxes(1, 2)
     return -windows.changing(momentum) - windows.along(force), windows.along(lost)
 
 
