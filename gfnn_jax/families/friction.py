@@ -255,11 +255,13 @@ class Friction:
         if not self._may_be_placed(q):
             return self._loads(u)
         places, xp = self._places(q), namespace(q, self.kinds)
-        return self._loads(u) * xp.where(self.placed, places * places, 1.0)
+        placed = xp.where(as_row(self.placed, places), places * places, 1.0)
+        return placed * self._loads(u)
 
     def _places(self, q: Any) -> Any:
         """c·q − C, of friction by the place, at q (..., d): (..., F)."""
-        return matmul(q, self.directions.astype(q.dtype).T) - self.widths
+        places = matmul(q, self.directions.astype(q.dtype).T)
+        return places - as_row(self.widths, places)
 
     def _loads(self, u: Any) -> Any:
         xp, loaded = namespace(self.kinds, u), self.loaded
@@ -320,7 +322,8 @@ class Friction:
         if not self._may_be_placed(q):
             return None
         c, d, xp = self.directions.astype(v.dtype), v.shape[-1], namespace(q, self.kinds)
-        slopes = xp.where(self.placed, 2 * self._places(q) * matmul(v, c.T), 0.0)
+        slopes = 2 * self._places(q) * matmul(v, c.T)
+        slopes = xp.where(as_row(self.placed, slopes), slopes, 0.0)
         outer = (c[:, :, None] * c[:, None, :]).reshape(-1, d**2)
         return matmul(as_row(losses, slopes) * slopes, outer).reshape(*v.shape, d)
 
