@@ -280,6 +280,24 @@ def test_the_shortest_waves_beside_longer_ones_may_be_a_series(waves, last):
     assert (found[2][1] if found else None) == last
 
 
+@pytest.mark.parametrize("zero", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
+def test_two_atoms_have_the_force_of_lennard_and_jones(zero):
+    """About a zero of the column too; a polynomial of degree 6 forecast nothing."""
+
+    def acceleration(q, v):  # V = e (r⁻¹² − 2 r⁻⁶), of frequency 1 at rest
+        r = q + zero
+        return (r**-13 - r**-7) / 6 - 0.004 * v
+
+    fit = gfnn.fit(recorded(acceleration, [1.25 - zero, 0.0], 40, 400))
+    assert re.fullmatch("one of several: 1/.* two of a few .*", fit.verdict)
+    terms = [t for t in fit.lagrangian.terms if "v" not in t.term]
+    assert [re.sub(r"\(.*\)", "x1", t.term) for t in terms] == ["1/x1**12", "1/x1**6"]
+    (from_there,) = {float(t.term.partition("+")[2].partition(")")[0] or 0) for t in terms}
+    assert from_there == pytest.approx(zero, abs=5e-3 if zero else 0.0)
+    for term, coefficient in zip(terms, (-1 / 72, 1 / 36), strict=True):
+        assert abs(term.coefficient - coefficient) < 4 * term.std
+
+
 def test_one_energy_does_not_tell_a_mass_from_a_potential_of_many_terms():
     def acceleration(q, v):  # M = 1 + (ax² − 1)², as of a bead on a wire; V = −b (ax³/3 − x + cx²)
         a, b, c = 1.2, 9.81, 0.7

@@ -27,7 +27,7 @@ from gfnn_jax.families.friction import (
     UNIFORM,
     kind_of,
 )
-from gfnn_jax.families.lagrangian import INPUTS, tree_of
+from gfnn_jax.families.lagrangian import INPUTS, shape_of, tree_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row
 
 KINDS = (*range(LOADED), LOADED, PLACED)
@@ -45,6 +45,11 @@ SHAPES = (  # of a length q, of which powers may be the series
     "sqrt(1+(A*q)**2) + q",
     "1/(1+A*q) + q",
     "1/(1+A*q)**3 + q",  # of two magnets
+    # Of two atoms (Lennard-Jones), of one and a wall, by the distance or from a zero of its own
+    "1/q**12 + 1/q**6",
+    "1/q**9 + 1/q**3",
+    "1/(q+A)**12 + 1/(q+A)**6",
+    "1/(q+A)**9 + 1/(q+A)**3",
     # Of one length about a centre C: wells of light, of Pöschl and Teller, of a charge, of a plate,
     # of a ring of current
     "exp(-(A*(q-C))**2)",
@@ -247,6 +252,13 @@ def last_of_series(rows: Sequence[Row]) -> Row | None:
     longer = {i for row in alone for i, m in enumerate(row[2]) if 0 < abs(m) < WAVES}
     shortest = (r for r in alone if any(abs(r[2][i]) == WAVES for i in longer))
     return next(shortest, None)
+
+
+def of_atoms(rows: Sequence[Row]) -> Row | None:
+    """The first potential of two atoms, or of one and a wall, None where there is none: their
+    powers are two of many that such laws have."""
+    alone = (row for row in rows if not any(row[0]))
+    return next((row for row in alone if re.search(r"\*\*(12|9)$", shape_of(row))), None)
 
 
 def central(dim: int, exponent: float) -> list[Row]:

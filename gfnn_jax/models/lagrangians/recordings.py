@@ -67,7 +67,14 @@ from gfnn_jax.models.lagrangians.in_words import (
 )
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.libraries import FEW, FRICTIONS, central, last_of_series, names_of
+from gfnn_jax.models.lagrangians.libraries import (
+    FEW,
+    FRICTIONS,
+    central,
+    last_of_series,
+    names_of,
+    of_atoms,
+)
 from gfnn_jax.models.lagrangians.nature import NO_COLUMN, Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
@@ -168,6 +175,11 @@ EARLY = (
 SERIES = (
     "terms up to {} may be a series of another shape, and hold within the "
     "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms"
+)
+
+ATOMS = (
+    "{} and the power beside it are two of a few that were tried: others may follow the record as "
+    "well, from another zero of the distance. Give those that you expect: --terms"
 )
 
 
@@ -325,9 +337,11 @@ def _with_early_inputs(law: LearnedLaw, dt: float) -> LearnedLaw:
 
 def _other_shapes(fit: LawFit) -> str:
     """A line on terms of other shapes that follow a record as the law does, "" where none do."""
-    last = last_of_series(fit.structure.terms)
+    last, of_atom = last_of_series(fit.structure.terms), of_atoms(fit.structure.terms)
     if last is not None:
         return SERIES.format(fit.problem.word(("term", last)))
+    if of_atom is not None:
+        return ATOMS.format(fit.problem.word(("term", of_atom)))
     return other_powers(fit, symbols(fit.problem.observation.coordinates))
 
 

@@ -267,6 +267,8 @@ def with_a_shape(fit: LawFit) -> LawFit:
         tried = _Shapes(fit, (*kept, *torques(1, [0]), *springs(1, [0])), (), times)
     else:
         series = own if d == 1 else [row for row in own if sum(row[1]) > 2]
+        if d == 1:  # of one energy, masses that depend on the place imitate a potential
+            series = [*series, *(row for row in structure.terms if row not in (*kept, *own))]
         shifted, many = fit.problem.observation.shifts(), len(series)
         plain = () if d == 1 else without_forces(potentials(d, range(d), 1, 2), shifted)
         tried = _Shapes(fit, kept, plain, "1")
@@ -282,14 +284,17 @@ def with_a_shape(fit: LawFit) -> LawFit:
         for (name, along), (near, _) in begun.items()
         if along == length
     ]
-    found, most = [(fit.criterion(), "", fit)], Options.near * min(left for *_, left in close)
+    count, most = fit.independent, Options.near * min(left for *_, left in close)
+    found = [(fit.criterion(), len(fit.p), "", fit)]
     for name, place, left in close:
         other = tried.fitted(name, length, place) if left <= most else None
         if other is not None:
-            found.append((other.criterion(fit.independent) + np.log(fit.independent), name, other))
-    least = min(cost for cost, _, _ in found) + fit.problem.options.evidence.deciding
-    near = [(len(one.p), name, one) for cost, name, one in found if cost < least]
-    fewest = [one for one in near if one[0] == min(near, key=lambda one: one[0])[0]]
+            inside = any(map(constants, other.structure.terms))  # a coefficient too
+            cost = other.criterion(count) + np.log(count) * inside
+            found.append((cost, len(other.p) + inside, name, other))
+    least = min(cost for cost, *_ in found) + fit.problem.options.evidence.deciding
+    near = [one[1:] for one in found if one[0] < least]
+    fewest = [one for one in near if one[0] == min(size for size, *_ in near)]
     if any(one is fit for *_, one in near) or len(fewest) > 1:
         return fit
     (_, name, best), *_ = fewest  # others as likely have a term more
@@ -312,7 +317,11 @@ class _Shapes:
     times: str
 
     def structure(self, name: str, along: Lengths, place: Place) -> Structure:
-        """The terms with this shape of each length ``along``, as `libraries.shaped` has it."""
+        """The terms with this shape of each length ``along``, as `libraries.shaped` has it; of
+        powers of q + A the constant is 2/(q + A) where the motion is closest to the zero of it."""
+        if "q+A" in name:
+            q = self.fit.problem.states[:, : self.fit.problem.dim] @ np.array(along).T
+            place = (float(2 / place[0] - (q.min() if place[0] > 0 else q.max())), place[1])
         ends = {tuple(map(bool, one)) for one in along}
         beside = [r for r in self.plain if sum(r[1]) < 2 or tuple(map(bool, r[1])) not in ends]
         shapes = (row for one in along for row in shaped(name, place, one, self.times))
@@ -342,6 +351,8 @@ class _Shapes:
     def closer(self, name: str, along: Lengths, near: Place) -> tuple[Place, float]:
         """The place near this one that leaves least, and what it leaves."""
         constant, centre = near
+        if "A" not in name:
+            return near, self.left(name, along, near)
         if is_centred(name):
 
             def moved(by: np.ndarray) -> Place:
