@@ -180,6 +180,19 @@ def test_a_part_of_an_orbit_tells_the_force_by_the_distance(eccentricity, part):
     )
 
 
+@pytest.mark.parametrize(("quartic", "amplitude"), [(0.055, 1.8), (0.03, 2.2)])
+def test_torsion_that_hardens_has_a_fourth_power(quartic, amplitude):
+    """V = ½ θ² + 0.055 θ⁴ was 2.0 cos θ + 1.4 θ² − 0.04 cos 2θ, identified."""
+
+    def acceleration(q, v):
+        return -q - 4 * quartic * q**3 - 0.03 * v
+
+    options = {"end": 60.0, "samples": 1_000, "noise": 2e-3, "angles": ["theta"]}
+    fit = gfnn.fit(recorded(acceleration, [amplitude, 0.0], ["theta"], **options))
+    named = "theta**4" in coefficients(fit.lagrangian) or "θ⁴ in place of cos(θ)" in fit.verdict
+    assert named, fit.verdict
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("periodic", [False, True])
 def test_torsion_of_a_radian_is_no_series_of_cosines(periodic):

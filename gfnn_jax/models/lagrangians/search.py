@@ -252,10 +252,12 @@ class TermSearch:
 
     def every_beside(self, fit: LawFit) -> Structure:
         """All terms that the law of a fit may come to: of angles of which it has powers, springs
-        too, and torques on angles."""
+        too, that harden or soften, and torques on angles."""
         assert self.every is not None
         d, within = self.every.dim, fit.problem.within_a_turn
-        rows = libraries.springs(d, [i for i in within if fit.structure.has_powers(i)])
+        sprung = [i for i in within if fit.structure.has_powers(i)]
+        rows = libraries.springs(d, sprung)
+        rows += [row for i in sprung for row in libraries.potentials(d, [i], 4)]
         rows += libraries.torques(d, fit.problem.angles)
         rows += libraries.driven(d, fit.problem.angles, fit.problem.num_inputs, False)
         rubs = self.every.friction if self.frictions is None else tuple(self._may_rub(fit))
