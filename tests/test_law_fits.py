@@ -453,6 +453,17 @@ def test_stribecks_friction_is_found_where_most_of_the_motion_is_fast():
     assert slow == pytest.approx(0.1, rel=0.05)  # of dry friction what is left at speed
 
 
+def test_friction_by_the_speed_to_three_halves_is_not_linear_and_quadratic_friction():
+    t, c = 0.15 * np.arange(400), 0.05
+    (x,) = motion(lambda q, v: -q - c * np.sign(v) * np.abs(v) ** 1.5, [1.3, 0.0], t)
+    x += 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions="x"))
+    (loss,) = fit.friction.terms
+    assert loss.term == "abs(v)**2.5"
+    assert abs(loss.coefficient - c / 2.5) < 4 * loss.std < 1e-3
+    assert fit.which_friction.kinds == ("power",)
+
+
 @pytest.mark.parametrize("centre", [0.0, 0.5])
 def test_friction_that_grows_with_the_square_of_the_place_is_found(centre):
     """ẍ = −x − c (x − x₀)² ẋ about a zero of the column. |v|³ and v⁴ imitated it, identified."""

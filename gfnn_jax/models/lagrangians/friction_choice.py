@@ -46,6 +46,7 @@ from gfnn_jax.families.friction import (
     LINEAR,
     LOADED,
     PLACED,
+    POWER,
     QUADRATIC,
     STRIBECK,
     UNIFORM,
@@ -57,7 +58,14 @@ from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion, imp
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
-from gfnn_jax.models.lagrangians.libraries import KINDS, feeds, losses, names_of, together
+from gfnn_jax.models.lagrangians.libraries import (
+    CUBIC,
+    KINDS,
+    feeds,
+    losses,
+    names_of,
+    together,
+)
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.models.lagrangians.text import Names, friction_of
 from gfnn_jax.solve.linear import non_negative
@@ -108,8 +116,10 @@ class FrictionChoice(NamedTuple):
         rows = [r for r in rows if r[1] not in self.kinds and not kind_of(r[1]).rare]
         largest = scale * np.array([self.limits[row] for row in rows])
         terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, names).terms
+        powers = {row[2] for row in self.rows if row[1] == POWER} - {CUBIC}
+        own = ["power" if k == POWER and powers else kind_of(k).name for k in self.kinds]
         return WhichFriction(
-            names_of(self.kinds),
+            tuple(own),
             {named(kinds): odds for kinds, odds in self.odds.items()},
             {t.term: t.coefficient for t in terms},
         )
@@ -117,9 +127,10 @@ class FrictionChoice(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class WhichFriction:
-    """The kinds of friction that a record shows. odds: that they forecast better than other kinds
-    ("none", "quadratic", "linear+dry", …). limits: of terms of R of kinds that were not seen, the
-    largest coefficients that the record allows (two standard errors)."""
+    """The kinds of friction that a record shows; "power" is one by a speed to another power than
+    the third. odds: that they forecast better than other kinds ("none", "quadratic", "linear+dry",
+    …). limits: of terms of R of kinds that were not seen, the largest coefficients that the record
+    allows (two standard errors)."""
 
     kinds: tuple[str, ...]
     odds: dict[str, float]

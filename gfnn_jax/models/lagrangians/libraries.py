@@ -410,6 +410,13 @@ def losses(
     return rows + [((0,) * dim, UNIFORM, 0.0)] * (UNIFORM in kinds)
 
 
+def between(losses: Sequence[Loss]) -> list[Loss]:
+    """Friction by the power 3/2 of the speed of a coordinate in place of linear and quadratic
+    friction, which together imitate it."""
+    both = [c for c, kind, *_ in losses if kind == QUADRATIC and (c, LINEAR, 0.0) in losses]
+    return [(c, POWER, 1.5) for c in both if sum(map(abs, c)) == 1]
+
+
 def together(kinds: Collection[int]) -> bool:
     """Return whether a law may have these kinds of friction beside each other by choice: Stribeck's
     is a part of dry friction."""

@@ -260,7 +260,9 @@ class TermSearch:
         rows += [row for i in sprung for row in libraries.potentials(d, [i], 4)]
         rows += libraries.torques(d, fit.problem.angles)
         rows += libraries.driven(d, fit.problem.angles, fit.problem.num_inputs, False)
-        rubs = self.every.friction if self.frictions is None else tuple(self._may_rub(fit))
+        rubs = self.every.friction
+        if self.frictions is not None:
+            rubs = (*self._may_rub(fit), *libraries.between(fit.structure.friction))
         every = dataclasses.replace(self.every, friction=rubs)
         return every.plus([("term", row) for row in rows])
 
@@ -336,8 +338,9 @@ class TermSearch:
         assert self.every is not None  # terms are searched
         terms = dataclasses.replace(self.every, friction=())
         other = self.prune(self.grow(other, terms), friction=False)
-        table = table_of(other, self._may_rub(other))
-        return other, chosen(table, rows=other.structure.friction)
+        rows = other.structure.friction
+        table = table_of(other, list(dict.fromkeys((*self._may_rub(other), *rows))))
+        return other, chosen(table, rows=rows)
 
     def telling_more(self, fit: LawFit) -> LawFit | None:
         """The fit to arcs of the length that tells the coefficients best, longer ones first as long
