@@ -10,6 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import coulomb_motion
 from coulomb_motion import Body
+from random_recordings import SYSTEMS, record
 
 OPTIONS = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
 
@@ -80,3 +81,9 @@ def test_a_block_that_slips_for_less_than_a_step(monkeypatch):
     x = both.follow(np.array([1 - a + w[0], 0.0, 1.0, 0.0]), w - w[0], **OPTIONS)
     w = np.minimum(w, 3 * a)
     np.testing.assert_allclose(x[:, 1], a * w**3 / 3 - w**4 / 12, atol=1e-13)
+
+
+def test_random_recordings_end_where_dry_friction_holds_them():
+    drawn = record(SYSTEMS["Hénon–Heiles"], np.random.default_rng([5, 15]))
+    assert drawn.kind == "dry"
+    np.testing.assert_allclose(drawn.states[-1, 2:] / drawn.omega, 0.0, atol=1e-12)
