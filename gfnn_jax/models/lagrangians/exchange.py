@@ -81,7 +81,7 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
     deciding = fit.problem.options.evidence.deciding
     for _ in range(Options.rounds):
         near = [_leaner(one, fit) for one in _near(fit, every)]
-        near = [one for one in near if len(one.fit.p) <= len(fit.p) and _explains(one.fit, fit)]
+        near = [one for one in near if len(one.fit.p) <= len(fit.p) and _explains(one, fit)]
         found = [Exchanged(fit, 0.0), *near]
         least = min(one.above for one in found)
         likely = [one for one in found if one.above < least + deciding]
@@ -94,11 +94,15 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
     return fit
 
 
-def _explains(other: LawFit, fit: LawFit) -> bool:
+def _explains(one: Exchanged, fit: LawFit) -> bool:
     """Return whether another fit explains much of the residuals of one, where these are correlated:
-    of their squares, or of their correlation, as chance does not."""
+    of their squares, or of their correlation, as chance does not. One of as many terms that is
+    plainer and likelier needs no more than that."""
+    other = one.fit
+    as_many = len(other.p) == len(fit.p)
     return (
         fit.correlation < Options.coloured
+        or (as_many and one.above < 0 and _plainness(other) < _plainness(fit))
         or other.fitted.cost < Options.explained * fit.fitted.cost
         or other.correlation - 1 < Options.whiter * (fit.correlation - 1)
     )
