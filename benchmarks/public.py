@@ -18,10 +18,7 @@ any was fitted: `MECHANICAL`, as recordings of a position and its velocity, angl
 or have friction that depends on position.
 
 Silverbox (Wigren & Schoukens, ECC 2013): the law of the multisine, and the free run of the arrow,
-which is the first 40,000 samples, from its first 20 on. A second row is told that one low-pass is
-before both channels, whose phase is `PHASE` (f ÷ `CORNER`)³ (a delay that both have shows nowhere):
-the number with which the free run of the multisine errs least, by least squares with the seven of
-the law. It is taken out of every column before the fit. Cascaded tanks (Schoukens & Noël, 2017):
+which is the first 40,000 samples, from its first 20 on. Cascaded tanks (Schoukens & Noël, 2017):
 the estimation record, of which there is no mechanical law. What it shows of this is told by free
 runs, of two tanks by Torricelli's law and of a mechanical law, both fitted to it.
 """
@@ -49,7 +46,6 @@ from gfnn_jax.models.brackets.fields import FreeField, fit_field
 from gfnn_jax.models.brackets.find import polynomials
 
 FILE, FOLDER = "--odebench", "--records"
-UNFILTERED = "silverbox-arrow-before-the-filter"
 # Number in ODEBench -> whether its position is an angle
 MECHANICAL = {24: False, 25: False, 28: True, 32: False, 34: True, 43: True, 44: True}
 POISSON = (27, 31)
@@ -57,12 +53,10 @@ GAMMAS = (0.0, 0.05)  # γ, of the multiplicative noise
 RATE = 1e7 / 2**14  # Hz, of Silverbox
 ARROW, MULTISINE = slice(0, 40_000), slice(40_650, 105_712)  # samples
 SEEN = 20  # samples that a free run begins with
-CORNER, PHASE = 200.0, 0.866  # Hz, and rad there, of a filter's phase
 FULL = 10.0  # V, beyond which the sensor of the tanks shows no more
 # The two states at first, and the numbers of `_two_tanks` and `_cubic_spring`, to begin with
 TANKS = np.array([4, 5.2, 0.05, 0.05, 0.05, 0.05])
 SPRING = np.array([0, 5.2, 0, -4e-4, 0, 0, 8e-4, 0.04, 0])
-PAD = 2_000  # samples at either end of a column that is filtered
 RIGHT = 0.9  # R² of a trajectory that counts as right
 TRAINED, AHEAD, A_PERIOD = 1000, 200, 100  # samples
 _TOLERANCES = {"rtol": 1e-13, "atol": 1e-13, "method": "DOP853"}
@@ -266,38 +260,6 @@ def silverbox(folder: Path, quick: bool) -> Numbers:
     return result
 
 
-def unfiltered(x: np.ndarray, phase: float = PHASE) -> np.ndarray:
-    """A column (n,) before a low-pass that turns the frequency f by ``phase`` (f ÷ `CORNER`)³ rad;
-    with −`PHASE`, behind it."""
-    padded = np.pad(x, PAD, mode="edge")
-    f = np.fft.rfftfreq(len(padded), 1 / RATE) / CORNER
-    turned = np.fft.rfft(padded) * np.exp(1j * phase * f**3)
-    return np.fft.irfft(turned, len(padded))[PAD:-PAD]
-
-
-def without_filter(folder: Path, quick: bool) -> Numbers:
-    """`silverbox` with columns before their filter; the free run goes through it again."""
-    table = np.loadtxt(folder / "SNLS80mV.csv", delimiter=",")
-
-    def recording(rows: slice) -> gfnn.Recording:
-        u, y = map(unfiltered, table[rows].T)
-        columns = {"t": np.arange(len(u)) / RATE, "u": u, "y": y}
-        return gfnn.Recording(columns, positions=["y"], inputs=["u"], angles=[])
-
-    fit, result = fitted(lambda: gfnn.fit(recording(MULTISINE)))
-    if fit is not None:
-        rows = slice(0, 4_000) if quick else ARROW
-        arrow = recording(rows)
-        t, y = arrow.times(arrow.runs[0]), arrow.values("y", arrow.runs[0])
-        ahead = fit.map.forecast(arrow.slice(stop=t[SEEN - 1]), t[SEEN:], arrow).values["y"][0]
-        run = unfiltered(np.concatenate([y[:SEEN], ahead]), -PHASE)[SEEN:]
-        missed = run - table[rows, 1][SEEN:]
-        result["rms_millivolts"] = 1e3 * float(np.sqrt(np.mean(missed**2)))
-        result["largest_millivolts"] = 1e3 * float(np.max(np.abs(missed)))
-    print(f"  {result}", flush=True)
-    return result
-
-
 def tanks(folder: Path, quick: bool) -> Numbers:
     """What is said of a record that is not mechanical."""
     table = pd.read_csv(folder / "dataBenchmark.csv")
@@ -396,7 +358,7 @@ def tables() -> None:
 
 def _records() -> None:
     """The two records of a folder."""
-    names = dict.fromkeys(("silverbox-arrow", UNFILTERED, "cascaded-tanks"))
+    names = dict.fromkeys(("silverbox-arrow", "cascaded-tanks"))
     found = results_of(names, "public")  # type: ignore[arg-type]
     if not found:
         return
@@ -428,6 +390,5 @@ if __name__ == "__main__":
         folder = Path(arguments[at + 1])
         del arguments[at : at + 2]
         PIECES |= {"silverbox-arrow": functools.partial(silverbox, folder)}
-        PIECES |= {UNFILTERED: functools.partial(without_filter, folder)}
         PIECES |= {"cascaded-tanks": functools.partial(tanks, folder)}
     main(__doc__ or "", PIECES, "public", tables, arguments, tuple(PIECES)[:2])

@@ -1,12 +1,14 @@
 """Laws that are one exchange of terms away, against the systems that made the records."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from analytic import motion
 
 import gfnn_jax as gfnn
+from gfnn_jax.models.lagrangians.exchange import Exchanged, _explains
 
 
 def record(rate, start, end, dt, noise, seed=0):
@@ -20,6 +22,25 @@ def record(rate, start, end, dt, noise, seed=0):
 
 def words(formula):
     return {term.term for term in formula.terms}
+
+
+@pytest.mark.parametrize(
+    ("other", "above", "taken"),
+    [(3, -5.0, True), (3, 1.0, False), (6, -5.0, False), (None, -5.0, False)],
+)
+def test_where_residuals_are_correlated_a_likelier_law_of_as_many_terms_is_plainer(
+    other, above, taken
+):
+    """x³ in place of x⁵, not x⁶, and not fewer terms, which leave out what friction takes."""
+
+    def fit(*powers):
+        terms = [((0,), (power,)) for power in powers]
+        structure = SimpleNamespace(terms=terms, friction=())
+        fitted = SimpleNamespace(cost=100.0)
+        return SimpleNamespace(p=powers, correlation=3.0, structure=structure, fitted=fitted)
+
+    one = Exchanged(fit(2, *[other] * (other is not None)), above)
+    assert _explains(one, fit(2, 5)) == taken
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ from gfnn_jax.data.roles import (
     ROLES,
     coordinates_in,
     is_run,
+    is_wave,
     role_of,
     symbols,
     unit_in,
@@ -58,6 +59,8 @@ from gfnn_jax.data.tables import (
 )
 from gfnn_jax.data.text_files import from_text
 from gfnn_jax.errors import InputError, unexpected
+from gfnn_jax.signals.filters import Options as Filters
+from gfnn_jax.signals.filters import turned
 from gfnn_jax.signals.wrong_values import TURN
 
 if TYPE_CHECKING:
@@ -368,6 +371,29 @@ class Recording:
     def driven_by(self, names: Sequence[str]) -> Recording:
         """The recording with these waves, cos(1.37*t), as further inputs."""
         return self._with(inputs=(*self.inputs, *names))
+
+    def behind_filter(self, phase: float) -> Recording:
+        """The recording as behind a filter of all columns (`signals.filters.turned`, s³); with
+        −``phase`` as before it. Raises InputError where angles are among them, steps are uneven, or
+        values are missing."""
+        names = [n for n in self.columns if n not in self.parameters and not is_wave(n)]
+        if self.angles:
+            raise InputError(f"{self.source}: expected no angles, got {', '.join(self.angles)}")
+        values = {}
+        for run, times in self._times.items():
+            own = {name: self._values[run][name] for name in names}
+            steps = np.diff(times)
+            whole = all(np.isfinite(column).all() for column in own.values())
+            if len(steps) < 2 or np.ptp(steps) > Filters.even * steps[0] or not whole:
+                raise InputError(
+                    f"{self.source}: run {run}: expected even steps and no missing value, as a "
+                    "filter of all columns needs"
+                )
+            behind = {name: turned(x, float(np.mean(steps)), phase) for name, x in own.items()}
+            for column in behind.values():
+                column.flags.writeable = False
+            values[run] = {**self._values[run], **behind}
+        return self._with(_values=values)
 
     def slice(
         self, start: float = -np.inf, stop: float = np.inf, run: str | float | None = None

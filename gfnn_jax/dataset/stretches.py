@@ -29,7 +29,7 @@ from gfnn_jax.signals.splines import FEWEST, Splines, splines, with_rates
 
 GAP = 3.5  # median steps: a longer one ends a stretch, where sampling is even or inputs act
 PER_PERIOD = 40  # nodes
-MOST_STEPS = 6_000  # of a fit: more tell little more
+MOST_STEPS = 6_000  # of a fit: more tell little more of its terms
 
 
 class Options:
@@ -398,15 +398,16 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
     return np.array(sigma)
 
 
-def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
-    """The nodes of all stretches; of a long recording those of blocks, spread evenly over it."""
+def nodes_of(found: Sequence[Stretch], scales: Scales, most: int = MOST_STEPS) -> list[Nodes]:
+    """The nodes of all stretches; of a recording of more than ``most`` steps those of blocks,
+    spread evenly over it."""
     if isinstance(scales.half, Splines):
         parts = [part for s in found for part in _between_gaps(s, scales, scales.half)]
     else:
         parts = [(s, np.arange(0, len(s.t), scales.every(scales.of(s)[0])), None) for s in found]
     total = sum(len(at) for _, at, _ in parts)
     length = round(Options.block * scales.per_period)
-    keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
+    keep = -(-total * scales.substeps // most)  # every so many blocks
     nodes, count = [], 0
     for s, at, states in parts:
         blocks = [at] if keep == 1 else [at[k : k + length] for k in range(0, len(at), length)]

@@ -120,7 +120,8 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     t = recording.times(run)
     begin = float(t[k])
     later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
-    start = recording.slice(float(t[k - _Options.samples + 1]), begin, run=run)
+    smeared = 2 * map_.sensors.smeared if map_.sensors is not None else 0.0
+    start = recording.slice(float(t[k - _Options.samples + 1]) - smeared, begin, run=run)
     own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own, coverage=TUBE)
     measured, values, std = {}, {}, {}

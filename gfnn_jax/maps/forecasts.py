@@ -5,16 +5,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.special import ndtri
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.maps import estimates, position_estimates
-from gfnn_jax.maps.sensors import TUBE
+from gfnn_jax.maps.sensors import TUBE, Sensors
+from gfnn_jax.signals.filters import turned
 from gfnn_jax.threads import one_thread
 
 
@@ -43,6 +46,32 @@ class Forecast(NamedTuple):
         """Upper edge (runs, n) of the band by name, None where no band was asked for."""
         return self._edge(1.0)
 
+    def at(self, times: np.ndarray) -> Forecast:
+        """The forecast at times (n,) between its own."""
+        found = self._each(lambda _, x: CubicSpline(self.times, x, axis=1)(times))
+        return found._replace(times=times)
+
+    @classmethod
+    def of_runs(cls, each: Sequence[Forecast]) -> Forecast:
+        """Join forecasts of one run each, at the same times."""
+
+        def joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+            return {n: np.concatenate([one[n] for one in parts]) for n in parts[0]}
+
+        values, std = joined([one.values for one in each]), joined([one.std for one in each])
+        bands = [one.band for one in each if one.band is not None]
+        outside = tuple(line for one in each for line in one.outside)
+        band = joined(bands) if bands else None
+        return cls(each[0].times, values, std, each[0].units, outside, band)
+
+    def _each(self, change: Callable[[str, np.ndarray], np.ndarray]) -> Forecast:
+        """Change values, standard deviations and bands, each (runs, n) of a name."""
+        values, std = (
+            {name: change(name, x) for name, x in of.items()} for of in (self.values, self.std)
+        )
+        band = self.band and {name: change(name, x) for name, x in self.band.items()}
+        return self._replace(values=values, std=std, band=band)
+
     def _edge(self, side: float) -> dict[str, np.ndarray] | None:
         if self.band is None:
             return None
@@ -57,17 +86,17 @@ class Forecast(NamedTuple):
     def divided(self, factors: Mapping[str, float], second: float = 1.0) -> Forecast:
         """Divide values, standard deviations and bands by the factors of their columns, times by
         ``second``."""
-        values, std, band = (
-            None if of is None else {name: x / factors.get(name, 1.0) for name, x in of.items()}
-            for of in (self.values, self.std, self.band)
-        )
-        return self._replace(times=self.times / second, values=values, std=std, band=band)
+        found = self._each(lambda name, x: x / factors.get(name, 1.0))
+        return found._replace(times=self.times / second)
 
 
 def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """`SymplecticMap.estimate`."""
+    kind = _kind(map_)
+    if map_.sensors.phase:
+        recording = recording.behind_filter(-map_.sensors.phase)
     with one_thread():
-        return _kind(map_).estimate(map_, recording)
+        return kind.estimate(map_, recording)
 
 
 class Asked(NamedTuple):
@@ -100,6 +129,8 @@ def forecast(
         raise InputError("expected rising times (n,) of a forecast")
     asked = asked or Asked()
     kind, whole, given = _kind(map_), asked.whole, (map_, recording, times, inputs)
+    if map_.sensors.phase:
+        return _behind_filter(map_, recording, times, inputs, asked)
     if whole is not None and kind is position_estimates:
         raise InputError("expected a law: of a map of positions alone only bands of each reading")
     with one_thread():
@@ -116,6 +147,53 @@ def forecast(
         factor = 2 * ndtri((1 + asked.coverage) / 2) / ndtri((1 + TUBE) / 2)
         return found._replace(band={name: factor * of for name, of in std.items()})
     return found
+
+
+def _behind_filter(
+    map_: Any, recording: Recording, times: np.ndarray, inputs: Recording | None, asked: Asked
+) -> Forecast:
+    """The forecast of columns that went through one filter: what moved before it is forecast, from
+    where the end of the recording smears nothing, and goes through the filter again."""
+    sensors, found = map_.sensors, list[Forecast]()
+    bare = dataclasses.replace(map_, sensors=dataclasses.replace(sensors, phase=0.0))
+    for run in recording.runs:
+        own, t = recording.slice(run=run), recording.times(run)
+        step = float(np.mean(np.diff(t)))
+        mixed = sensors.smeared + 2 * step
+        known = own.behind_filter(-sensors.phase)
+        known = known.slice(stop=max(t[-1] - mixed, t[min(estimates.FEWEST, len(t)) - 1]))
+        seen, end, outside, driven = known.times(run), times[-1] + mixed, (), None
+        if inputs is not None:
+            ahead = _inputs_along(own, inputs, sensors)
+            driven, last = ahead.behind_filter(-sensors.phase), float(ahead.times("0")[-1])
+            if last < end:
+                end = max(last, times[-1])
+                outside = (
+                    f"run {run}: the inputs end at {last:g} s, and the filter mixes what follows "
+                    f"into the last {mixed:.2g} s: give inputs for longer",
+                )
+        later = seen[-1] + step * np.arange(1, 1 + int(np.ceil((end - seen[-1]) / step - 1e-6)))
+        one = forecast(bare, known, later, driven, asked)
+        values = dict(one.values)
+        for name in set(values) & set(known.columns):
+            whole = np.concatenate([known.values(name, run), values[name][0]])
+            values[name] = turned(whole, step, sensors.phase)[None, len(seen) :]
+        found.append(one._replace(values=values, outside=(*one.outside, *outside)).at(times))
+    return Forecast.of_runs(found)
+
+
+def _inputs_along(own: Recording, inputs: Recording, sensors: Sensors) -> Recording:
+    """The inputs of one run, from its begin on to where those ahead end."""
+    (run,) = own.runs
+    there = run if len(inputs.runs) > 1 else next(iter(inputs.runs))
+    t, begun = inputs.times(there), own.times(run)
+    earlier = begun < t[0]
+    columns = {
+        name: np.concatenate([own.values(name, run)[earlier], inputs.values(name, there)])
+        for name in sensors.inputs
+    }
+    names = tuple(sensors.inputs)
+    return Recording({"t": np.concatenate([begun[earlier], t]), **columns}, inputs=names)
 
 
 def _kind(map_: Any) -> Any:

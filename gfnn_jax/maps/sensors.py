@@ -60,8 +60,9 @@ class Sensors:
     the largest errors of held-out forecasts from their start to each lead, as multiples of the tube
     that their law gives; None where unknown. observed: seconds of data that they are from. level:
     relative standard deviation of the strength of friction between times of the data; where it is
-    not 0 each state is estimated with its own. rivals: laws whose forecasts the bands hold too, by
-    their shares.
+    not 0 each state is estimated with its own. phase: of the filter (`signals.filters`, s³) that
+    all columns went through; 0 where none is known. rivals: laws whose forecasts the bands hold
+    too, by their shares.
     """
 
     positions: tuple[str, ...]
@@ -85,6 +86,12 @@ class Sensors:
     level: float = 0.0
     rivals: tuple[OtherLaw, ...] = ()
     of_law: bool = False
+    phase: float = 0.0
+
+    @property
+    def smeared(self) -> float:
+        """Seconds by which the filter mixes what moves up to three times as fast as the motion."""
+        return 3 * abs(self.phase) * (3 * self.omega) ** 2
 
     def with_level(self, level: float) -> Sensors:
         """The same with a level of friction, and windows of a quarter of the longest held-out

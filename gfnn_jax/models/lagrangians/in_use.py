@@ -37,13 +37,14 @@ from gfnn_jax.solve.linear import covariance_root
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordingData:
     """Samples of a recording as a fit sees them: the problem of its law, segments without gaps, the
-    known mass, and what was left out."""
+    known mass, and what was left out. phase: of the filter (s³) that its columns stand before."""
 
     recording: Recording
     problem: ArcProblem
     segments: Sequence[Stretch]
     mass: Mapping[str, float] = dataclasses.field(default_factory=dict)
     messages: tuple[str, ...] = ()
+    phase: float = 0.0
 
     @property
     def given(self) -> np.ndarray:

@@ -19,6 +19,7 @@ from gfnn_jax.data.recording import Recording, channels_of, parameters_of
 from gfnn_jax.data.roles import by_name, is_wave, symbols, wave_names
 from gfnn_jax.data.traits import without_wrong_values
 from gfnn_jax.dataset.stretches import (
+    MOST_STEPS,
     Moving,
     Stretch,
     arcs_of,
@@ -39,7 +40,7 @@ from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import OtherLaw
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians import libraries, one_filter
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
 from gfnn_jax.models.lagrangians.exchange import leaves_open, other_terms, rivals
@@ -168,6 +169,12 @@ DRIVEN = (
     "phase of the times in the file. Record the drive, and name it: --inputs"
 )
 
+FILTERED = (
+    "all columns look as if they had gone through one filter, as of a logger, that turns waves of "
+    "{:.4g} rad/s by {} rad and others as the cube of their frequency: the law is of what moves "
+    "before it, and forecasts go through it again"
+)
+
 EARLY = (
     "their times are late, as of a filter or of a second clock: shift the column. Or they answer "
     "the motion, as a controller does, and do not drive it: name what drives it (--inputs)"
@@ -286,12 +293,16 @@ def fit_recording(
         except FitError as error:
             raise _with_nature(error, data) from None
 
-    data, found, of_drive = _with_hidden_drive(recording, searched, _rules(recording, input_hold))
-    recording = data.recording
+    rules = _rules(recording, input_hold)
+    data, found, of_drive = _with_hidden_drive(recording, searched, rules)
+    data, found, of_filter = _before_filter(
+        data, found, lambda recording: searched(recording, *rules)
+    )
+    recording, messages = data.recording, (*left_out, *of_drive, *of_filter)
     missed = no_law(data.problem.scales) if _misses(found.fit) else None
     explained = False
     try:
-        best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
+        best, findings = _findings(recording, data, found, messages, steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
         if not terms and not hidden:
@@ -771,6 +782,42 @@ def _with_hidden_drive(
     return data, found, ()
 
 
+def _before_filter(
+    data: RecordingData,
+    found: SearchResult,
+    search_in: Callable[[Recording], tuple[RecordingData, SearchResult]],
+) -> tuple[RecordingData, SearchResult, tuple[str, ...]]:
+    """The law of what moved before one filter of all columns, where that is clearly likelier, and a
+    message on the filter; else the law as it is."""
+    recording, problem = data.recording, data.problem
+    driven = not all(map(is_wave, recording.inputs)) and problem.observation.is_plain
+    if not driven or problem.angles or problem.parameters:
+        return data, found, ()
+
+    def before(phase: float, most: int = MOST_STEPS) -> ArcProblem:
+        earlier = recording.behind_filter(-phase)
+        moving = _segments(earlier, problem.observation, problem.angles, problem.parameters)
+        moving = without_rests(moving, problem.scales).stretches if data.messages else moving
+        nodes = nodes_of(moving, problem.scales, most)
+        return dataclasses.replace(problem, nodes=nodes, inputs=None)
+
+    with contextlib.suppress(FitError, InputError):
+        phase, omega = one_filter.phase_of(found.fit, before), problem.scales.omega
+        if phase is None:
+            return data, found, ()
+        problem.on_progress(f"a filter of all columns: {phase * omega**3:.3g} rad at {omega:.4g}/s")
+        own, law = search_in(recording.behind_filter(-phase))
+        again = one_filter.lowest(law.fit, before, phase)
+        if abs(again.phase - phase) > again.error:  # another law has another phase
+            phase = again.phase
+            own, law = search_in(recording.behind_filter(-phase))
+        if one_filter.is_likelier(law.fit, found.fit):
+            turn, error = phase * omega**3, again.error * omega**3
+            said = FILTERED.format(omega, measured(turn, error))
+            return dataclasses.replace(own, phase=phase), law, (said,)
+    return data, found, ()
+
+
 def _louder_with(fit: LawFit, driven: Recording, stiff: bool) -> bool:
     """Return whether a law leaves much of what it left by itself with the forces of a drive too,
     with the stiffnesses that it may drive, and with linear friction, which is not seen beside
@@ -866,4 +913,4 @@ def _map(data: RecordingData, best: CalibratedLaw) -> SymplecticMap:
         args=problem.args,
         root=best.root,
     )
-    return dataclasses.replace(map_, sensors=sensors)
+    return dataclasses.replace(map_, sensors=dataclasses.replace(sensors, phase=data.phase))
