@@ -35,6 +35,19 @@ def recorded(acceleration, start, names, end=40.0, samples=2_000, noise=1e-4, **
     return gfnn.Recording({"t": t, **columns}, positions=names, **roles)
 
 
+@pytest.mark.slow
+def test_four_bodies_on_hardening_springs_start_from_springs_of_neighbours():
+    """Beyond three coordinates the library of bodies is that of neighbours, to a degree."""
+
+    def acceleration(q, v):
+        apart = np.diff([0.0, *q, 0.0])
+        return np.diff(apart + 0.5 * apart**3)
+
+    start = [0.9, -0.3, 0.5, -0.8, 0.0, 0.0, 0.0, 0.0]
+    fit = gfnn.fit(recorded(acceleration, start, ["x1", "x2", "x3", "x4"], noise=1e-3))
+    assert fit.verdict != "identified" or "x1**4" in coefficients(fit.lagrangian)
+
+
 def coefficients(expression):
     return {term.term: term.coefficient for term in expression.terms}
 

@@ -136,9 +136,9 @@ def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return list(dict.fromkeys([start, *masses, *potentials]))
 
 
-def side_by_side(dim: int, angles: tuple[int, ...]) -> list[Row]:
+def side_by_side(dim: int, angles: tuple[int, ...], highest: int = 2) -> list[Row]:
     """A chain or ring of pendulums on axes of their own, or of bodies, with springs between
-    neighbours: cos q_i and cos(q_i − q_j), or lengths."""
+    neighbours: cos q_i and cos(q_i − q_j), or lengths to a degree."""
     rows, none = uncoupled(dim, angles), (0,) * dim
     for pair in ((i, (i + 1) % dim) for i in range(dim)):
         if all(i in angles for i in pair):
@@ -146,7 +146,7 @@ def side_by_side(dim: int, angles: tuple[int, ...]) -> list[Row]:
                 (none, none, tuple((i == pair[0]) - (i == pair[1]) for i in range(dim)), 0.0)
             )
         lengths = [i for i in pair if i not in angles]
-        rows += potentials(dim, lengths, 2)
+        rows += potentials(dim, lengths, *range(2, highest + 1))
     return list(dict.fromkeys(rows))
 
 
