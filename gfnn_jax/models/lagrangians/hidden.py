@@ -24,6 +24,7 @@ import numpy as np
 from gfnn_jax.budget import Allowance, Counted, within
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError, OutOfTime
 from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.fitting.evidence import criterion
@@ -61,7 +62,7 @@ class HiddenOptions:
     finished: int = 3
     damped: float = 0.003
     most: float = 5e8
-    each: float = 4e7
+    each: float = 5e7
 
 
 OPTIONS = HiddenOptions()
@@ -243,9 +244,10 @@ def _sensor_of(problem: ArcProblem) -> Hidden:
 
 
 def _starts(problem: ArcProblem, cap: Counted) -> Iterator[LawFit]:
-    """Starts along short arcs, from each set of oscillations: of modes those that leave noise alone
-    as soon as they are found, then the best of the others; first with odd forces, then, from the
-    best sets, with all."""
+    """Starts from each set of oscillations: of pendulums along short arcs, of modes along longer
+    ones too, for along short ones wrong modes leave less than those that are right and have not
+    converged. Of modes those that leave noise alone as soon as they are found, then the best of the
+    others; first with odd forces, then, from the best sets, with all."""
     longest = max(problem.nodes, key=lambda n: len(n.t))
     found = oscillations(longest.t, longest.y[:, 0], problem.dim)
     sets = [_from(problem, one) for one in found]
@@ -255,7 +257,7 @@ def _starts(problem: ArcProblem, cap: Counted) -> Iterator[LawFit]:
     for degrees in OPTIONS.degrees:
         left, others = np.full(len(sets), np.inf), list[LawFit]()
         for k, one in enumerate(sets):
-            fit = within(_at_most(cap, OPTIONS.each), partial(_of_modes, one, degrees))
+            fit = within(_at_most(cap, OPTIONS.each), partial(_along_two, one, degrees))
             if fit is None:
                 continue
             left[k] = misfit(fit)
@@ -287,8 +289,9 @@ def _best_pendulums(problem: ArcProblem) -> Iterator[LawFit]:
 def _along_longer_arcs(fit: LawFit, most: float) -> LawFit:
     """A start along longer and longer arcs, as far as it follows them to ``most`` times the noise,
     or may do so once it converges."""
+    nodes, known = fit.problem.nodes, fit.arcs.t.shape[1]
     lengths = map(fit.problem.length, fit.problem.options.periods[1:])
-    for length in [n for n in lengths if n > fit.arcs.t.shape[1]]:
+    for length in [n for n in lengths if arcs_of(nodes, n).t.shape[1] > known]:
         if misfit(fit) > (most if fit.fitted.converged else STARTS.followed):
             break
         if (longer := to_longer_arcs(fit, length)) is None:
@@ -312,6 +315,14 @@ def _started(problem: ArcProblem, shapes: np.ndarray) -> ArcProblem:
         for n in problem.nodes
     ]
     return dataclasses.replace(problem, nodes=nodes)
+
+
+def _along_two(problem: ArcProblem, degrees: Iterable[int]) -> LawFit:
+    """Modes along short arcs, and along longer ones where their orbits follow these."""
+    fit = _of_modes(problem, degrees)
+    if misfit(fit) > STARTS.followed:
+        return fit
+    return to_longer_arcs(fit, problem.length(problem.options.periods[1])) or fit
 
 
 def _of_modes(problem: ArcProblem, degrees: Iterable[int]) -> LawFit:
