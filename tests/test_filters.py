@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import InputError
-from gfnn_jax.signals.filters import turned
+from gfnn_jax.signals.filters import mixed, turned
 
 STEP, PHASE = 0.35, 0.06  # s, s³
 
@@ -21,6 +21,16 @@ def test_a_filter_turns_each_wave_by_the_cube_of_its_frequency():
     np.testing.assert_allclose(turned(waves, 0.1, 0.01)[inside], behind[inside], atol=1e-3)
     again = turned(turned(waves, 0.1, 0.01), 0.1, -0.01)
     np.testing.assert_allclose(again[inside], waves[inside], atol=1e-3)
+
+
+def test_ends_err_no_longer_than_a_filter_mixes():
+    rng, t = np.random.default_rng(0), 0.4 * np.arange(2500)
+    omega, at = rng.uniform(0.3, 2.2, 300), rng.uniform(0, 2 * np.pi, 300)
+    x = np.cos(np.multiply.outer(t, omega) + at).sum(axis=1) / np.sqrt(150)
+    last = int(mixed(0.4, PHASE) / 0.4) + 1
+    for end in (1200, 1357, 1811):
+        left = turned(x[:end], 0.4, -PHASE) - turned(x, 0.4, -PHASE)[:end]
+        assert np.abs(left[200:-last]).max() < 5e-3
 
 
 @pytest.mark.parametrize("broken", ["angles", "uneven", "missing"])

@@ -11,6 +11,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.maps.sensors import TUBE
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.signals.filters import mixed
 
 
 class _Options:
@@ -120,8 +121,9 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     t = recording.times(run)
     begin = float(t[k])
     later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
-    smeared = 2 * map_.sensors.smeared if map_.sensors is not None else 0.0
-    start = recording.slice(float(t[k - _Options.samples + 1]) - smeared, begin, run=run)
+    phase = 0.0 if map_.sensors is None else map_.sensors.phase
+    over = 2 * mixed(float(t[1] - t[0]), phase) if phase else 0.0
+    start = recording.slice(float(t[k - _Options.samples + 1]) - over, begin, run=run)
     own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own, coverage=TUBE)
     measured, values, std = {}, {}, {}

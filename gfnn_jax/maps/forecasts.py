@@ -17,7 +17,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.maps import estimates, position_estimates
 from gfnn_jax.maps.sensors import TUBE, Sensors
-from gfnn_jax.signals.filters import turned
+from gfnn_jax.signals.filters import mixed, turned
 from gfnn_jax.threads import one_thread
 
 
@@ -159,10 +159,10 @@ def _behind_filter(
     for run in recording.runs:
         own, t = recording.slice(run=run), recording.times(run)
         step = float(np.mean(np.diff(t)))
-        mixed = sensors.smeared + 2 * step
+        over = mixed(step, sensors.phase)
         known = own.behind_filter(-sensors.phase)
-        known = known.slice(stop=max(t[-1] - mixed, t[min(estimates.FEWEST, len(t)) - 1]))
-        seen, end, outside, driven = known.times(run), times[-1] + mixed, (), None
+        known = known.slice(stop=max(t[-1] - over, t[min(estimates.FEWEST, len(t)) - 1]))
+        seen, end, outside, driven = known.times(run), times[-1] + over, (), None
         if inputs is not None:
             ahead = _inputs_along(own, inputs, sensors)
             driven, last = ahead.behind_filter(-sensors.phase), float(ahead.times("0")[-1])
@@ -170,7 +170,7 @@ def _behind_filter(
                 end = max(last, times[-1])
                 outside = (
                     f"run {run}: the inputs end at {last:g} s, and the filter mixes what follows "
-                    f"into the last {mixed:.2g} s: give inputs for longer",
+                    f"into the last {over:.2g} s: give inputs for longer",
                 )
         later = seen[-1] + step * np.arange(1, 1 + int(np.ceil((end - seen[-1]) / step - 1e-6)))
         one = forecast(bare, known, later, driven, asked)

@@ -88,11 +88,6 @@ class Sensors:
     of_law: bool = False
     phase: float = 0.0
 
-    @property
-    def smeared(self) -> float:
-        """Seconds by which the filter mixes what moves up to three times as fast as the motion."""
-        return 3 * abs(self.phase) * (3 * self.omega) ** 2
-
     def with_level(self, level: float) -> Sensors:
         """The same with a level of friction, and windows of a quarter of the longest held-out
         forecast, two periods: a level takes longer to tell than a state."""

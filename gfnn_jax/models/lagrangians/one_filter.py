@@ -24,7 +24,8 @@ class Options:
     tried: phases, in radians at the frequency of the fastest motion. settled: of their spacing;
     apart: of it, over which what is left is differenced. longer: times the steps of a fit, of which
     a phase close by is found, for what the law lacks moves it. coloured: samples over which
-    residuals are correlated, where a law leaves more than noise.
+    residuals are correlated, and loud: times the noise, either of which a law leaves that lacks
+    something.
     """
 
     tried: tuple[float, ...] = tuple(k / 40 for k in range(-4, 17))
@@ -32,6 +33,7 @@ class Options:
     apart: float = 0.1
     longer: int = 4
     coloured: float = 1.2
+    loud: float = 1.0
 
 
 class Found(NamedTuple):
@@ -48,7 +50,7 @@ def phase_of(fit: LawFit, before: Callable[..., ArcProblem]) -> float | None:
 
     ``before`` makes the problem of the columns before a filter of a phase (s³), of the steps of a
     fit or of ``most``."""
-    if fit.correlation < Options.coloured:
+    if fit.correlation < Options.coloured and fit.loudest < Options.loud:
         return None
     unit, count = fit.problem.scales.omega**-3, fit.independent
     least = 2 * EVIDENCE.logarithm + np.log(count)
