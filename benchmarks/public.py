@@ -367,8 +367,8 @@ def _records() -> None:
         m = result["measured"]
         error = f"{number(m['rms_millivolts'])} mV" if "rms_millivolts" in m else "–"
         law = f"`{m['formula']}`, R = `{m['friction']}`" if m.get("formula") else "–"
-        law = law.replace("|", "\\|")
         said = m.get("refused", m.get("verdict", ""))
+        law, said = (text.replace("|", "\\|") for text in (law, said))
         if "explained_by_tanks" in m:
             shares = (m["explained_by_tanks"], m["explained_by_a_mechanical_law"])
             error = "explains {:.0%} as two tanks, {:.0%} as a mechanical law".format(*shares)
