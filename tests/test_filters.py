@@ -89,7 +89,7 @@ def test_a_law_of_what_moves_before_a_filter_is_found(logged):
 def test_forecasts_are_of_the_columns_behind_the_filter(logged, tmp_path):
     made, fit = logged
     fit.save(tmp_path / "model")
-    start, ahead = made.slice(2420 * STEP, 2500 * STEP), made.slice(2500.5 * STEP, 2900 * STEP)
+    start, ahead = made.slice(2000 * STEP, 2500 * STEP), made.slice(2500.5 * STEP, 2900 * STEP)
     times, x = ahead.times("0"), ahead.values("x", "0")
     for one in (fit, gfnn.load(tmp_path / "model")):
         found = one.map.forecast(start, times, made, coverage=0.95)
@@ -97,7 +97,10 @@ def test_forecasts_are_of_the_columns_behind_the_filter(logged, tmp_path):
         assert np.sqrt(np.mean(left**2)) < 0.01 * x.std()
         assert found.band is not None
         assert np.mean(left < found.band["x"][0]) > 0.85
+    few = fit.map.forecast(start.slice(2480 * STEP), times, made)
+    assert any("few" in line for line in few.outside)
     short = fit.map.forecast(start, times, ahead)  # the inputs end with it
+    assert not any("few" in line for line in short.outside)
     assert any("inputs end" in line for line in short.outside)
     late = fit.map.forecast(start, times[:-1] + 0.4 * STEP, made).values["x"][0]
     np.testing.assert_allclose(late, CubicSpline(times, x)(times[:-1] + 0.4 * STEP), atol=0.02)

@@ -11,7 +11,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.maps.sensors import TUBE
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.signals.filters import mixed
+from gfnn_jax.signals.filters import needed
 
 
 class _Options:
@@ -122,7 +122,7 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     begin = float(t[k])
     later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
     phase = 0.0 if map_.sensors is None else map_.sensors.phase
-    over = 2 * mixed(float(t[1] - t[0]), phase) if phase else 0.0
+    over = 1.01 * needed(float(t[1] - t[0]), phase) if phase else 0.0
     start = recording.slice(float(t[k - _Options.samples + 1]) - over, begin, run=run)
     own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own, coverage=TUBE)

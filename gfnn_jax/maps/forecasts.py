@@ -17,7 +17,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.maps import estimates, position_estimates
 from gfnn_jax.maps.sensors import TUBE, Sensors
-from gfnn_jax.signals.filters import mixed, turned
+from gfnn_jax.signals.filters import mixed, needed, turned
 from gfnn_jax.threads import one_thread
 
 
@@ -162,18 +162,26 @@ def _behind_filter(
         over = mixed(step, sensors.phase)
         known = own.behind_filter(-sensors.phase)
         known = known.slice(stop=max(t[-1] - over, t[min(estimates.FEWEST, len(t)) - 1]))
-        seen, end, outside, driven = known.times(run), times[-1] + over, (), None
+        inner, outside, enough = known, list[str](), needed(step, sensors.phase)
+        if t[-1] - t[0] >= enough:
+            inner = known.slice(start=t[0] + over)
+        else:
+            outside.append(
+                f"run {run}: {t[-1] - t[0]:.2g} s of samples are few where a filter mixes those of "
+                f"{over:.2g} s: errors are larger than the bands say; give {enough:.2g} s"
+            )
+        seen, end, driven = known.times(run), times[-1] + over, None
         if inputs is not None:
             ahead = _inputs_along(own, inputs, sensors)
             driven, last = ahead.behind_filter(-sensors.phase), float(ahead.times("0")[-1])
             if last < end:
                 end = max(last, times[-1])
-                outside = (
+                outside.append(
                     f"run {run}: the inputs end at {last:g} s, and the filter mixes what follows "
-                    f"into the last {over:.2g} s: give inputs for longer",
+                    f"into the last {over:.2g} s: give inputs for longer"
                 )
         later = seen[-1] + step * np.arange(1, 1 + int(np.ceil((end - seen[-1]) / step - 1e-6)))
-        one = forecast(bare, known, later, driven, asked)
+        one = forecast(bare, inner, later, driven, asked)
         values = dict(one.values)
         for name in set(values) & set(known.columns):
             whole = np.concatenate([known.values(name, run), values[name][0]])

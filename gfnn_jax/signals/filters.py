@@ -13,6 +13,7 @@ class Options:
     from the most recent samples; rank: of its columns, relative. reflected: samples beyond these,
     at most. most: radians, beyond which frequencies are late alike: a motion has little there, and
     noise would be mixed over long times. tail: times this delay, over which waves are mixed.
+    enough: times that, of a record whose ends are predicted and left out.
     """
 
     even: float = 0.01
@@ -22,13 +23,14 @@ class Options:
     rank: float = 1e-4
     most: float = 4 * np.pi
     tail: float = 1.5
+    enough: float = 15.0
 
 
 def turned(x: np.ndarray, step: float, phase: float) -> np.ndarray:
     """Columns (n, ...) behind a filter of this ``phase`` (s³); before one, with −``phase``.
 
-    ``step`` is the time between samples, in s. Beyond the ends they are continued as reflected
-    there, so that values within `mixed` s of an end err.
+    ``step`` is the time between samples, in s. Beyond the ends columns are continued by linear
+    prediction, so that values within `mixed` s of an end err.
 
         t = 0.01 * np.arange(500)
         turned(np.cos(9 * t), 0.01, 1e-4)  # cos(9 t − 0.0729), but for the ends
@@ -68,6 +70,11 @@ def mixed(step: float, phase: float) -> float:
     """Seconds over which such a filter mixes columns of this step."""
     latest = 3 * abs(phase) * min(np.pi / step, _corner(phase)) ** 2
     return Options.tail * latest + 2 * step
+
+
+def needed(step: float, phase: float) -> float:
+    """Seconds of samples behind such a filter that tell a state as samples before it do."""
+    return Options.enough * mixed(step, phase)
 
 
 def _corner(phase: float) -> float:
